@@ -1,0 +1,110 @@
+"""A batch of host simulators: the interface that the host driver steps."""
+
+import abc
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vecpsmbpo.types import EnvSpec
+
+
+class Simulator(abc.ABC):
+    """One original simulator, with actions in [-1, 1] and no time limit of its own."""
+
+    @abc.abstractmethod
+    def reset(self) -> np.ndarray:
+        """Begins an episode: obs [O]."""
+
+    @abc.abstractmethod
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+        """One control step: action [A] -> obs [O], reward, terminated."""
+
+    @abc.abstractmethod
+    def save(self) -> dict[str, Any]:
+        """All that is needed to go on exactly as if nothing had happened, in JSON's types."""
+
+    @abc.abstractmethod
+    def load(self, saved: dict[str, Any]) -> None:
+        """The inverse of `save`."""
+
+
+class HostStep(NamedTuple):
+    """What a step of B environments gives.
+
+    Attributes:
+        obs: [B, O] the states that the next actions start from: after the automatic reset where an episode ended.
+        reward: [B].
+        terminated: [B] bool.
+        truncated: [B] bool, the time limit was reached.
+        next_obs: [B, O] the true successors, also where an episode ended.
+    """
+
+    obs: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    next_obs: np.ndarray
+
+
+class HostEnv:
+    """B simulators of one task, stepped together, reset on their own.
+
+    Attributes:
+        spec: of the task.
+        episode_length: the time limit, `spec.episode_length` unless set otherwise.
+    """
+
+    def __init__(self, spec: EnvSpec, simulators: Sequence[Simulator]):
+        self.spec = spec
+        self.episode_length = spec.episode_length
+        self._simulators = list(simulators)
+        self._lengths = np.zeros(len(self._simulators), np.int64)
+        self._obs = np.zeros((len(self._simulators), spec.obs_size), np.float32)
+
+    @property
+    def num_envs(self) -> int:
+        return len(self._simulators)
+
+    def reset(self) -> np.ndarray:
+        """Begins an episode everywhere: obs [B, O]."""
+        self._lengths[:] = 0
+        self._obs = np.stack([simulator.reset() for simulator in self._simulators]).astype(np.float32)
+        return self._obs
+
+    def step(self, actions: np.ndarray) -> HostStep:
+        """actions [B, A] in [-1, 1]; values outside are clipped.
+
+        Raises:
+            ValueError: `actions` has another shape.
+        """
+        if np.shape(actions) != (self.num_envs, self.spec.action_size):
+            expected = (self.num_envs, self.spec.action_size)
+            raise ValueError(f"actions must have shape {expected}, not {np.shape(actions)}")
+        actions = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+        results = [simulator.step(action) for simulator, action in zip(self._simulators, actions, strict=True)]
+        next_obs, reward, terminated = (np.asarray(column) for column in zip(*results, strict=True))
+        next_obs = next_obs.astype(np.float32)
+        self._lengths += 1
+        truncated = (self._lengths >= self.episode_length) & ~terminated
+        self._obs = next_obs.copy()
+        for index in np.flatnonzero(terminated | truncated):
+            self._obs[index] = self._simulators[index].reset()
+            self._lengths[index] = 0
+        return HostStep(self._obs, reward.astype(np.float32), terminated, truncated, next_obs)
+
+    def save(self) -> dict[str, Any]:
+        """The state of every simulator, in JSON's types."""
+        return {
+            "lengths": self._lengths.tolist(),
+            "obs": self._obs.tolist(),
+            "simulators": [simulator.save() for simulator in self._simulators],
+        }
+
+    def load(self, saved: dict[str, Any]) -> np.ndarray:
+        """The inverse of `save`: the observations [B, O] that the next actions start from."""
+        self._lengths = np.array(saved["lengths"], np.int64)
+        self._obs = np.array(saved["obs"], np.float32)
+        for simulator, state in zip(self._simulators, saved["simulators"], strict=True):
+            simulator.load(state)
+        return self._obs

@@ -1,0 +1,1 @@
+"""MJX ports, one file per task, each a `brax.envs.base.Env`."""

@@ -1,0 +1,121 @@
+"""A MuJoCo task on MJX as a Brax environment."""
+
+import abc
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from brax.envs.base import Env, State
+from flax import struct
+from mujoco import mjx
+
+from vecpsmbpo.types import EnvSpec
+
+
+@struct.dataclass
+class Physics:
+    """All that the simulator needs to go on: what lies between two control steps.
+
+    The rest of `mjx.Data` is a function of it, and is recomputed by the step. This keeps the state of an environment
+    to a few dozen floats: a reset inside a scan is a cheap select, and a checkpoint does not depend on MJX's layout.
+
+    Shapes: qpos [nq], qvel [nv], warmstart [nv] (the solver's starting point, `qacc_warmstart`).
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    warmstart: jax.Array
+
+
+class MjxEnv(Env):
+    """Base of the MJX ports: a subclass gives the model, the reset distribution, observation, reward and spec.
+
+    There is no auto-reset and no time limit inside: `step` returns the true successor, `State.done` is termination
+    only.
+    """
+
+    spec: EnvSpec
+
+    def __init__(self, model: mujoco.MjModel, substeps: int):
+        """
+        Args:
+            model: of the original task, unchanged.
+            substeps: simulator steps per control step.
+        """
+        self.model = model
+        self.substeps = substeps
+        self._mjx_model = mjx.put_model(model, impl="jax")
+        self._blank = mjx.make_data(model, impl="jax")
+
+    # what a task defines
+
+    @abc.abstractmethod
+    def initial_state(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """A draw from ρ(s): qpos [nq], qvel [nv]."""
+
+    @abc.abstractmethod
+    def observe(self, physics: Physics) -> jax.Array:
+        """[O]."""
+
+    @abc.abstractmethod
+    def reward(self, before: Physics, action: jax.Array, after: Physics) -> jax.Array:
+        """[], for the control step that led from `before` to `after`."""
+
+    def terminated(self, physics: Physics) -> jax.Array:
+        """[] bool. Never, unless a task says otherwise."""
+        return jnp.bool_(False)
+
+    # the environment
+
+    def reset(self, rng: jax.Array) -> State:
+        return self.state_at(*self.initial_state(rng))
+
+    def state_at(self, qpos: jax.Array, qvel: jax.Array) -> State:
+        """The state at a simulator state: qpos [nq], qvel [nv], with a cold solver."""
+        qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
+        physics = Physics(qpos, qvel, warmstart=jnp.zeros_like(qvel))
+        return State(physics, self.observe(physics), reward=jnp.zeros(()), done=jnp.zeros(()))  # type: ignore[arg-type]
+
+    def step(self, state: State, action: jax.Array) -> State:
+        before: Any = state.pipeline_state
+        action = jnp.clip(action, -1.0, 1.0)
+        # TF32 matrix products hurt physics on GPUs.
+        with jax.default_matmul_precision("highest"):
+            after = self._advance(before, self.control(action))
+            return state.replace(  # type: ignore[attr-defined]
+                pipeline_state=after,
+                obs=self.observe(after),
+                reward=self.reward(before, action, after),
+                done=self.terminated(after).astype(jnp.float32),
+            )
+
+    def control(self, action: jax.Array) -> jax.Array:
+        """Actions in [-1, 1] -> the actuators' control range, [A] each."""
+        low, high = jnp.asarray(self.model.actuator_ctrlrange, jnp.float32).T
+        return low + (action + 1) * (high - low) / 2
+
+    def _advance(self, physics: Physics, control: jax.Array) -> Physics:
+        def substep(_, physics: Physics) -> Physics:
+            data = self._blank.replace(
+                qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.warmstart, ctrl=control
+            )
+            data = mjx.step(self._mjx_model, data)
+            return Physics(data.qpos, data.qvel, data.qacc_warmstart)
+
+        if self.substeps == 1:
+            return substep(0, physics)
+        return jax.lax.fori_loop(0, self.substeps, substep, physics)
+
+    @property
+    def observation_size(self) -> int:
+        return self.spec.obs_size
+
+    @property
+    def action_size(self) -> int:
+        return self.spec.action_size
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+

@@ -1,0 +1,1 @@
+"""One file per algorithm: init, act, observe, refresh and learn, written for one seed."""

@@ -1,0 +1,72 @@
+"""Rolls policies out in models: the rows of D_M^{n,m} (Algorithm 1, lines 9 and 10), and how many there are."""
+
+import jax
+import jax.numpy as jnp
+
+from vecpsmbpo import dynamics, replay, sac
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import EnvSpec, Model, Params, Transition
+
+LARGEST_CHUNK = 4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
+
+
+def chunk_size(settings: Settings) -> int:
+    """Start states rolled out together: the largest divisor of `rollout_starts` up to `LARGEST_CHUNK`."""
+    starts = min(settings.rollout_starts, settings.imagined_capacity)
+    return max(size for size in range(1, min(starts, LARGEST_CHUNK) + 1) if starts % size == 0)
+
+
+def ring_capacity(settings: Settings) -> int:
+    """C_M: what one epoch can imagine for a member at the longest horizon, up to `imagined_capacity`.
+
+    A multiple of the chunk, so that a block of rows never wraps.
+    """
+    horizon = max(settings.horizon_first, settings.horizon_last)
+    wanted = settings.rollout_starts * horizon * settings.refreshes_per_epoch
+    chunk = chunk_size(settings)
+    return max(min(wanted, settings.imagined_capacity) // chunk, 1) * chunk
+
+
+def horizon(settings: Settings, env_steps: jax.Array) -> jax.Array:
+    """Table 1's schedule x → y over epochs a → b: ⌊clip(x + (k - a) / (b - a) · (y - x))⌋.
+
+    k counts epochs of 1000 environment steps, whatever `epoch_steps` is.
+    """
+    first, last = settings.horizon_first, settings.horizon_last
+    start, end = settings.horizon_ramp_start, settings.horizon_ramp_end
+    # The small addend keeps an exact corner, such as k = b, from being floored away by float32 rounding.
+    value = first + (env_steps / 1000 - start) / (end - start) * (last - first) + 1e-4
+    return jnp.floor(jnp.clip(value, min(first, last), max(first, last))).astype(jnp.int32)
+
+
+def chunks_per_refresh(settings: Settings, horizon: jax.Array) -> jax.Array:
+    """How many chunks of start states one refresh rolls out.
+
+    When starts × horizon would exceed the ring, there are fewer starts; a rollout is never cut short.
+    """
+    chunk = chunk_size(settings)
+    return jnp.clip(ring_capacity(settings) // (horizon * chunk), 1, settings.rollout_starts // chunk)
+
+
+def step(
+    model: Model, actor: Params, obs: jax.Array, key: jax.Array, *, settings: Settings, spec: EnvSpec
+) -> Transition:
+    """One imagined step of one member for a batch of states.
+
+    Args:
+        obs: [B, O].
+
+    Returns:
+        Transition with leaves [B, ...]; the policy's sampled action, the model's sampled successor and reward
+        (equation 21), and the task's own termination rule.
+    """
+    action_key, model_key = jax.random.split(key)
+    action, _ = sac.make_networks(settings, spec).actor.apply(actor, obs).sample(action_key)
+    net = dynamics.network(settings, spec)
+    next_obs, reward = dynamics.predict(model, obs, action, model_key, net=net)
+    return Transition(obs, action, reward, next_obs, spec.terminated(obs, action, next_obs))
+
+
+def start_states(real: jax.Array, rows: jax.Array, key: jax.Array, count: int, spec: EnvSpec) -> jax.Array:
+    """[count, O] observations drawn uniformly from D_E, [C, F]."""
+    return real[replay.sample_indices(key, (count,), rows, real.shape[0]), : spec.obs_size]

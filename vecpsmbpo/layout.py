@@ -1,0 +1,183 @@
+"""The one place where single models, agents and seeds become batches, and where batches lie on devices.
+
+The devices form a mesh of two axes, `seeds` × `members`. Seeds never talk to one another. Members of a seed are
+spread over the second axis, rounded up to it; the real data, the environment and the posterior are replicated along
+it, and the few values that cross it (the acting policy's action, the models) are collectives below. A laptop's two
+cores, one GPU and eight GPUs are the same program on a different mesh.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import SeedState, TrainState
+
+SEEDS, MEMBERS = "seeds", "members"
+_BY_SEED, _BY_MEMBER = PartitionSpec(SEEDS), PartitionSpec(SEEDS, MEMBERS)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How S seeds of N models and N·M members lie on a mesh.
+
+    Attributes:
+        mesh: of devices, axes `seeds` × `members`.
+        num_seeds: S.
+        n_models: N.
+        n_policies: M.
+        sequential: members of one device run one after the other (`lax.map`) instead of batched (`vmap`). On a CPU
+            core, whose cache holds one member's parameters but not all of them, this is faster; the arithmetic is the
+            same.
+    """
+
+    mesh: Mesh
+    num_seeds: int
+    n_models: int
+    n_policies: int
+    sequential: bool
+
+    @classmethod
+    def of(cls, settings: Settings) -> "Layout":
+        """Uses every device of the process that can be given work, or the first `settings.devices` of them."""
+        devices = jax.devices()
+        count = min(settings.devices or len(devices), len(devices), settings.num_seeds * settings.n_members)
+        over_seeds = math.gcd(settings.num_seeds, count)
+        grid = np.array(devices[:count]).reshape(over_seeds, count // over_seeds)
+        return cls(
+            mesh=Mesh(grid, (SEEDS, MEMBERS)),
+            num_seeds=settings.num_seeds,
+            n_models=settings.n_models,
+            n_policies=settings.n_policies,
+            sequential=devices[0].platform == "cpu",
+        )
+
+    # how many there are
+
+    @property
+    def shards(self) -> int:
+        """Devices along the member axis."""
+        return self.mesh.shape[MEMBERS]
+
+    @property
+    def n_members(self) -> int:
+        """N·M."""
+        return self.n_models * self.n_policies
+
+    @property
+    def padded_models(self) -> int:
+        return -(-self.n_models // self.shards) * self.shards
+
+    @property
+    def padded_members(self) -> int:
+        """P. Members from N·M on fill the mesh; the posterior never draws them and no file shows them."""
+        return -(-self.n_members // self.shards) * self.shards
+
+    # inside the program, for one seed on one device
+
+    def model_ids(self) -> jax.Array:
+        """Indices of this device's models."""
+        local = self.padded_models // self.shards
+        return jax.lax.axis_index(MEMBERS) * local + jnp.arange(local)
+
+    def member_ids(self) -> jax.Array:
+        """Indices n·M + m of this device's members."""
+        local = self.padded_members // self.shards
+        return jax.lax.axis_index(MEMBERS) * local + jnp.arange(local)
+
+    def model_of(self, member: jax.Array) -> jax.Array:
+        """n of member n·M + m; padding members share the last model."""
+        return jnp.minimum(member // self.n_policies, self.n_models - 1)
+
+    def keys(self, key: jax.Array, ids: jax.Array) -> jax.Array:
+        """A key per model or member that depends on its index and not on the mesh."""
+        return jax.vmap(partial(jax.random.fold_in, key))(ids)
+
+    def map_local(self, function: Callable, *batched: Any) -> Any:
+        """`function` of one model or member, applied to each of this device's."""
+        if self.sequential:
+            return jax.lax.map(lambda args: function(*args), batched)
+        return jax.vmap(function)(*batched)
+
+    def models_of_members(self, models: Any) -> Any:
+        """This device's models [N_local, ...] -> for each of its members the model that it learns in [P_local, ...]."""
+        everywhere = jax.tree.map(lambda x: jax.lax.all_gather(x, MEMBERS, tiled=True), models)
+        chosen = self.model_of(self.member_ids())
+        return jax.tree.map(lambda x: x[chosen], everywhere)
+
+    def ask(self, member: jax.Array, tree: Any, function: Callable = lambda params: params) -> Any:
+        """`function` of the leaves [...] that `member` has in `tree` [P_local, ...]: computed by every device for one
+        of its own members, taken from the device where `member` lives."""
+        local = self.padded_members // self.shards
+        index = member - jax.lax.axis_index(MEMBERS) * local
+        here = (index >= 0) & (index < local)
+        index = jnp.clip(index, 0, local - 1)
+        answer = function(jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, index, keepdims=False), tree))
+        masked = jax.tree.map(lambda x: jnp.where(here, x, jnp.zeros_like(x)), answer)
+        return jax.lax.psum(masked, MEMBERS)
+
+    def mean_over_members(self, values: jax.Array) -> jax.Array:
+        """[P_local, ...] -> the mean over the N·M members, [...]."""
+        real = self.member_ids() < self.n_members
+        kept = jnp.where(real.reshape(-1, *(1,) * (values.ndim - 1)), values, 0.0)
+        return jax.lax.psum(jnp.sum(kept, axis=0), MEMBERS) / self.n_members
+
+    # around the program
+
+    def specs(self) -> TrainState:
+        """Where every part of a train state lies: a prefix of its tree."""
+        seeds: Any = SeedState(**dict.fromkeys(SeedState.__dataclass_fields__, _BY_SEED))
+        seeds = seeds.replace(models=_BY_MEMBER, agents=_BY_MEMBER, imagined=_BY_MEMBER)
+        return TrainState(counters=PartitionSpec(), seeds=seeds, env=_BY_SEED)  # type: ignore[arg-type]
+
+    def spread(self, function: Callable, in_specs: Any, out_specs: Any, **jit: Any) -> Callable:
+        """`function` of a device's part, jitted over the whole mesh."""
+        # Replication along `members` holds by construction (equal inputs, equal programs); jax's static check of it
+        # cannot follow MJX's while loops.
+        body = jax.shard_map(
+            function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
+        )
+        return jax.jit(body, **jit)
+
+    def shardings(self, state: TrainState) -> TrainState:
+        """A sharding per leaf of `state` (arrays or shapes)."""
+        specs = jax.tree.broadcast(self.specs(), state, is_leaf=lambda x: isinstance(x, PartitionSpec))
+        return jax.tree.map(
+            lambda spec: NamedSharding(self.mesh, spec), specs, is_leaf=lambda x: isinstance(x, PartitionSpec)
+        )
+
+    def unpad(self, state: TrainState) -> TrainState:
+        """`state` without the padding members and models: what a checkpoint holds, whatever mesh it came from."""
+        return self._resize(state, self.n_models, self.n_members)
+
+    def place(self, state: TrainState) -> TrainState:
+        """An unpadded state, padded to this mesh and laid out on it."""
+        padded = self._resize(state, self.padded_models, self.padded_members)
+        return jax.device_put(padded, self.shardings(padded))
+
+    def _resize(self, state: TrainState, models: int, members: int) -> TrainState:
+        seeds = state.seeds
+        if seeds.agents.log_alpha.shape[1] == members and seeds.models.loss.shape[1] == models:
+            return state
+
+        def resize(tree, count):
+            # Padding repeats the first entry: any valid numbers do.
+            index = np.arange(count) % jax.tree.leaves(tree)[0].shape[1]
+            if count <= jax.tree.leaves(tree)[0].shape[1]:
+                return jax.tree.map(lambda x: x[:, :count], tree)
+            return jax.tree.map(lambda x: x[:, index], tree)
+
+        return state.replace(
+            seeds=seeds.replace(
+                models=resize(seeds.models, models),
+                agents=resize(seeds.agents, members),
+                imagined=resize(seeds.imagined, members),
+            )
+        )

@@ -1,0 +1,97 @@
+"""The three networks of the paper: dynamics (A.1), actor and twin critic (A.2)."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+MIN_LOG_VARIANCE, MAX_LOG_VARIANCE = -10.0, 2.0
+MIN_SCALE = 1e-3  # Acme's floor under the standard deviation of the policy
+
+model_init = nn.initializers.variance_scaling(1.0, "fan_in", "truncated_normal")
+policy_init = nn.initializers.variance_scaling(1.0, "fan_in", "uniform")
+
+
+class GaussianMLP(nn.Module):
+    """Diagonal Gaussian over (Δs, r), with its log-variance softly clamped to [-10, 2] (A.1)."""
+
+    output_size: int
+    hidden_size: int
+    hidden_layers: int
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """inputs [..., O + A], whitened -> mean, log-variance [..., O + 1] each."""
+        hidden = inputs
+        for _ in range(self.hidden_layers):
+            hidden = nn.swish(nn.Dense(self.hidden_size, kernel_init=model_init)(hidden))
+        outputs = nn.Dense(2 * self.output_size, kernel_init=model_init)(hidden)
+        mean, log_variance = jnp.split(outputs, 2, axis=-1)
+        log_variance = MAX_LOG_VARIANCE - nn.softplus(MAX_LOG_VARIANCE - log_variance)
+        log_variance = MIN_LOG_VARIANCE + nn.softplus(log_variance - MIN_LOG_VARIANCE)
+        return mean, log_variance
+
+
+class ReluMLP(nn.Module):
+    """Dense layers with ReLU between them, and a linear output."""
+
+    output_size: int
+    hidden_size: int
+    hidden_layers: int
+
+    @nn.compact
+    def __call__(self, hidden: jax.Array) -> jax.Array:
+        for _ in range(self.hidden_layers):
+            hidden = nn.relu(nn.Dense(self.hidden_size, kernel_init=policy_init)(hidden))
+        return nn.Dense(self.output_size, kernel_init=policy_init)(hidden)
+
+
+class TanhGaussian(NamedTuple):
+    """The law of tanh(u), u ~ Normal(loc, scale²), independently per action; loc and scale [..., A]."""
+
+    loc: jax.Array
+    scale: jax.Array
+
+    def sample(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Reparameterized action [..., A] and its log-density [...]."""
+        noise = jax.random.normal(key, self.loc.shape)
+        pre_tanh = self.loc + self.scale * noise
+        log_normal = -0.5 * noise**2 - jnp.log(self.scale) - 0.5 * jnp.log(2 * jnp.pi)
+        # log(1 - tanh²u) = 2 (log 2 - u - softplus(-2u)): no cancellation where tanh saturates.
+        log_slope = 2 * (jnp.log(2.0) - pre_tanh - jax.nn.softplus(-2 * pre_tanh))
+        return jnp.tanh(pre_tanh), jnp.sum(log_normal - log_slope, axis=-1)
+
+    def mode(self) -> jax.Array:
+        """tanh(loc) [..., A]: the action taken in evaluation."""
+        return jnp.tanh(self.loc)
+
+
+class Actor(nn.Module):
+    """π(a | s), tanh-Gaussian."""
+
+    action_size: int
+    hidden_size: int
+    hidden_layers: int
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> TanhGaussian:
+        """obs [..., O] -> law of actions [..., A]."""
+        outputs = ReluMLP(2 * self.action_size, self.hidden_size, self.hidden_layers)(obs)
+        loc, raw_scale = jnp.split(outputs, 2, axis=-1)
+        return TanhGaussian(loc, nn.softplus(raw_scale) + MIN_SCALE)
+
+
+class TwinCritic(nn.Module):
+    """Two independent Q(s, a)."""
+
+    hidden_size: int
+    hidden_layers: int
+
+    @nn.compact
+    def __call__(self, obs: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """obs [..., O], action [..., A] -> Q_1 [...], Q_2 [...]."""
+        inputs = jnp.concatenate([obs, action], axis=-1)
+        first = ReluMLP(1, self.hidden_size, self.hidden_layers, name="first")(inputs)
+        second = ReluMLP(1, self.hidden_size, self.hidden_layers, name="second")(inputs)
+        return first[..., 0], second[..., 0]

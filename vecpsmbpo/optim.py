@@ -1,0 +1,17 @@
+"""Adam with a traced learning rate."""
+
+from typing import Any
+
+import jax
+import optax
+
+from vecpsmbpo.types import Params
+
+_adam = optax.scale_by_adam()
+init = _adam.init
+
+
+def step(gradient: Params, optimizer: Any, params: Params, rate: jax.Array) -> tuple[Params, Any]:
+    """The parameters one Adam step further, and the optimizer's new state."""
+    direction, optimizer = _adam.update(gradient, optimizer)
+    return jax.tree.map(lambda p, d: p - rate * d, params, direction), optimizer

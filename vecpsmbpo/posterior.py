@@ -1,0 +1,34 @@
+"""q(π | D, λ): which member acts (equations 18 and 19)."""
+
+import jax
+import jax.numpy as jnp
+
+from vecpsmbpo.types import Posterior
+
+
+def init(members: int) -> Posterior:
+    return Posterior(returns=jnp.zeros(members), compensation=jnp.zeros(members))
+
+
+def credit(posterior: Posterior, member: jax.Array, episode_return: jax.Array, counts: jax.Array) -> Posterior:
+    """Adds an episode's return to its member where `counts` (equation 19 sums over all past episodes).
+
+    Compensated (Kahan) addition: after hundreds of episodes of thousands, plain float32 sums would be off by more
+    than the 1e-5 to which the probabilities can be recomputed from the log.
+    """
+    gain = jnp.where(counts, episode_return, 0.0) * jax.nn.one_hot(member, posterior.returns.shape[0])
+    gain = gain - posterior.compensation
+    total = posterior.returns + gain
+    return Posterior(returns=total, compensation=(total - posterior.returns) - gain)
+
+
+def logits(posterior: Posterior, temperature: jax.Array) -> jax.Array:
+    """[N·M] accumulated return / τ (equation 19). τ = ∞ gives the uniform distribution of equation 18."""
+    centred = posterior.returns - jnp.max(posterior.returns)  # before dividing: keeps small differences exact
+    return (centred - posterior.compensation) / temperature
+
+
+def draw(posterior: Posterior, temperature: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A member, [] int, and the distribution [N·M] that it was drawn from."""
+    scores = logits(posterior, temperature)
+    return jax.random.categorical(key, scores), jax.nn.softmax(scores)

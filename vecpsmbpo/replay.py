@@ -1,0 +1,56 @@
+"""Ring buffer of packed transitions: pure functions over one [C, F] array.
+
+A transition is one row of F = 2 O + A + 2 floats, so that drawing a minibatch is one gather. The number of rows
+ever added is kept by the caller (see `types.Counters`).
+"""
+
+import jax
+import jax.numpy as jnp
+
+from vecpsmbpo.types import Transition
+
+
+def row_size(obs_size: int, action_size: int) -> int:
+    """F."""
+    return 2 * obs_size + action_size + 2
+
+
+def init(capacity: int, obs_size: int, action_size: int) -> jax.Array:
+    """An empty ring [C, F]."""
+    return jnp.zeros((capacity, row_size(obs_size, action_size)), jnp.float32)
+
+
+def pack(transition: Transition) -> jax.Array:
+    """Transition with leaves [..., O], [..., A], [...] -> rows [..., F]."""
+    obs, action, reward, next_obs, terminated = transition
+    scalars = jnp.stack([reward, terminated.astype(jnp.float32)], axis=-1)
+    return jnp.concatenate([obs, action, next_obs, scalars], axis=-1).astype(jnp.float32)
+
+
+def unpack(rows: jax.Array, obs_size: int, action_size: int) -> Transition:
+    """The inverse of `pack`."""
+    obs, action, next_obs, scalars = jnp.split(
+        rows, [obs_size, obs_size + action_size, 2 * obs_size + action_size], axis=-1
+    )
+    return Transition(obs, action, scalars[..., 0], next_obs, scalars[..., 1])
+
+
+def add(ring: jax.Array, rows: jax.Array, added: jax.Array) -> jax.Array:
+    """Writes rows [..., B, F] into ring [..., C, F] after the `added` rows that it has received so far.
+
+    B must divide C, and every earlier block must have been of B rows too: a block never wraps.
+    """
+    position = added % ring.shape[-2]
+    start = (*(0,) * (ring.ndim - 2), position, 0)
+    return jax.lax.dynamic_update_slice(ring, rows, start)
+
+
+def sample_indices(key: jax.Array, shape: tuple[int, ...], added: jax.Array, capacity: int) -> jax.Array:
+    """Uniform indices of stored rows, with replacement. An empty ring gives zeros."""
+    return jax.random.randint(key, shape, 0, jnp.clip(added, 1, capacity))
+
+
+def count(added: jax.Array, new: jax.Array, capacity: int) -> jax.Array:
+    """`added + new`, less whole turns of a full ring: position and fullness stay, and int32 never overflows."""
+    total = added + new
+    return jnp.where(total < capacity, total, capacity + total % capacity)

@@ -1,0 +1,132 @@
+"""ONE soft actor-critic agent (A.2, equations 22 to 29): init, act, update.
+
+As in Acme, and as the paper says: twin Q functions and no value network, so that V in equations 24 and 29 is
+min(Q_1, Q_2) - α log π under the target critic; the temperature α is learned.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vecpsmbpo import networks, optim
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import Agent, AgentStats, EnvSpec, Hyper, Params, Transition
+
+
+class Networks(NamedTuple):
+    actor: networks.Actor
+    critic: networks.TwinCritic
+
+
+def make_networks(settings: Settings, spec: EnvSpec) -> Networks:
+    size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
+    return Networks(networks.Actor(spec.action_size, size, layers), networks.TwinCritic(size, layers))
+
+
+def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> Agent:
+    actor_key, critic_key = jax.random.split(key)
+    obs, action = jnp.zeros(spec.obs_size), jnp.zeros(spec.action_size)
+    actor, critic = nets.actor.init(actor_key, obs), nets.critic.init(critic_key, obs, action)
+    log_alpha = jnp.zeros(())
+    return Agent(
+        actor=actor,
+        critic=critic,
+        target_critic=critic,
+        log_alpha=log_alpha,
+        actor_optimizer=optim.init(actor),
+        critic_optimizer=optim.init(critic),
+        alpha_optimizer=optim.init(log_alpha),
+        stats=no_stats(),
+    )
+
+
+def no_stats() -> AgentStats:
+    return AgentStats(*jnp.zeros(6))
+
+
+def target_value(
+    reward: jax.Array, terminated: jax.Array, next_q: jax.Array, next_log_prob: jax.Array, alpha, discount
+) -> jax.Array:
+    """r + γ (1 - terminated) (Q̄(s', a') - α log π(a' | s')) (equations 23, 24 and 29), elementwise.
+
+    A truncated transition has terminated = 0 and bootstraps.
+    """
+    return reward + discount * (1 - terminated) * (next_q - alpha * next_log_prob)
+
+
+def critic_loss(
+    critic: Params, agent: Agent, batch: Transition, discount: jax.Array, key: jax.Array, *, nets: Networks
+) -> tuple[jax.Array, jax.Array]:
+    """½ (Q - Q̂)² for both critics (equation 27), and the mean of Q over the batch."""
+    next_action, next_log_prob = nets.actor.apply(agent.actor, batch.next_obs).sample(key)
+    next_q = jnp.minimum(*nets.critic.apply(agent.target_critic, batch.next_obs, next_action))
+    alpha = jnp.exp(agent.log_alpha)
+    target = target_value(batch.reward, batch.terminated, next_q, next_log_prob, alpha, discount)
+    first, second = nets.critic.apply(critic, batch.obs, batch.action)
+    return 0.5 * jnp.mean((first - target) ** 2 + (second - target) ** 2), jnp.mean(first)
+
+
+def actor_loss(
+    actor: Params, critic: Params, alpha: jax.Array, obs: jax.Array, key: jax.Array, *, nets: Networks
+) -> tuple[jax.Array, jax.Array]:
+    """E[α log π(a | s) - min Q(s, a)] (equations 25 and 28), and the mean log-probability."""
+    action, log_prob = nets.actor.apply(actor, obs).sample(key)
+    q = jnp.minimum(*nets.critic.apply(critic, obs, action))
+    return jnp.mean(alpha * log_prob - q), jnp.mean(log_prob)
+
+
+def update(agent: Agent, batch: Transition, hyper: Hyper, key: jax.Array, *, nets: Networks) -> Agent:
+    """One gradient step of critic, actor and temperature, and one of the target critic's average.
+
+    Args:
+        batch: leaves [B, ...].
+    """
+    critic_key, actor_key = jax.random.split(key)
+    rate = hyper.policy_learning_rate
+
+    critic_value_and_grad = jax.value_and_grad(critic_loss, has_aux=True)
+    (loss_q, q_mean), gradient = critic_value_and_grad(
+        agent.critic, agent, batch, hyper.discount, critic_key, nets=nets
+    )
+    critic, critic_optimizer = optim.step(gradient, agent.critic_optimizer, agent.critic, rate)
+
+    alpha = jnp.exp(agent.log_alpha)
+    actor_value_and_grad = jax.value_and_grad(actor_loss, has_aux=True)
+    (loss_pi, log_prob), gradient = actor_value_and_grad(
+        agent.actor, critic, alpha, batch.obs, actor_key, nets=nets
+    )
+    actor, actor_optimizer = optim.step(gradient, agent.actor_optimizer, agent.actor, rate)
+
+    # ∂/∂(log α) of E[-α (log π + target entropy)]: entropy below its target raises α.
+    gradient = -alpha * (log_prob + hyper.target_entropy)
+    log_alpha, alpha_optimizer = optim.step(gradient, agent.alpha_optimizer, agent.log_alpha, rate)
+
+    target_critic = jax.tree.map(
+        lambda average, new: average + hyper.target_update_rate * (new - average), agent.target_critic, critic
+    )
+    news = AgentStats(
+        updates=jnp.ones(()), critic_loss=loss_q, actor_loss=loss_pi, alpha=alpha, q_mean=q_mean, entropy=-log_prob
+    )
+    return Agent(
+        actor=actor,
+        critic=critic,
+        target_critic=target_critic,
+        log_alpha=log_alpha,
+        actor_optimizer=actor_optimizer,
+        critic_optimizer=critic_optimizer,
+        alpha_optimizer=alpha_optimizer,
+        stats=jax.tree.map(jnp.add, agent.stats, news),
+    )
+
+
+def updates(agent: Agent, batches: Transition, hyper: Hyper, key: jax.Array, *, nets: Networks) -> Agent:
+    """G updates in a row. Args: batches: leaves [G, B, ...]."""
+
+    def body(agent, xs):
+        batch, key = xs
+        return update(agent, batch, hyper, key, nets=nets), None
+
+    count = batches.reward.shape[0]
+    return jax.lax.scan(body, agent, (batches, jax.random.split(key, count)))[0]
+

@@ -1,0 +1,179 @@
+"""Every setting of a run, with its type and range. Knows nothing of Hydra or JAX, so mistakes answer at once.
+
+What each setting does is written beside its value in `configs/`; where a number comes from, too.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+Range = tuple[float | None, float | None]
+
+
+class SettingError(Exception):
+    """A mistake in a setting: one line that names the setting and what it may be."""
+
+
+def _whole(at_least: int, at_most: int | None = None) -> Any:
+    return dataclasses.field(metadata={"range": (at_least, at_most)})
+
+
+def _real(at_least: float | None = None, at_most: float | None = None, *, open_low: bool = False) -> Any:
+    return dataclasses.field(metadata={"range": (at_least, at_most), "open_low": open_low})
+
+
+def _choice(*names: str) -> Any:
+    return dataclasses.field(metadata={"choices": names})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """One run, resolved. Hashable: shapes and loop lengths are read from here when a program is traced."""
+
+    # what runs
+    env: str
+    algo: str
+    size: str
+    backend: str = _choice("auto", "mjx", "host")
+    seed: int = _whole(0, 2**31 - 1)
+    num_seeds: int = _whole(1)
+    total_steps: int = _whole(1)
+    run_dir: str
+    # the loop around it
+    epoch_steps: int = _whole(1)
+    episode_length: int = _whole(1)
+    eval_episodes: int = _whole(1)
+    eval_policy: str = _choice("posterior", "best", "average")
+    checkpoint_every: int = _whole(1)
+    devices: int = _whole(0)
+    compile_cache: bool
+    # real data
+    warmup_steps: int = _whole(1)
+    replay_capacity: int = _whole(1)
+    # dynamics models (A.1)
+    n_models: int = _whole(1)
+    model_hidden_size: int = _whole(1)
+    model_hidden_layers: int = _whole(1)
+    model_learning_rate: float = _real(0, open_low=True)
+    model_weight_decay: float = _real(0)
+    model_batch_size: int = _whole(1)
+    model_update_every: int = _whole(1)
+    model_patience: int = _whole(1)
+    model_improvement: float = _real(0, 1)
+    model_max_epochs: int = _whole(1)
+    validation_ratio: float = _real(0, 0.5, open_low=True)
+    # imagined data
+    rollout_starts: int = _whole(1)
+    imagined_capacity: int = _whole(1)
+    horizon_first: int = _whole(1)
+    horizon_last: int = _whole(1)
+    horizon_ramp_start: float = _real(0)
+    horizon_ramp_end: float = _real(0)
+    # policies (A.2)
+    n_policies: int = _whole(1)
+    policy_hidden_size: int = _whole(1)
+    policy_hidden_layers: int = _whole(1)
+    policy_learning_rate: float = _real(0, open_low=True)
+    policy_batch_size: int = _whole(1)
+    updates_per_step: int = _whole(1)
+    discount: float = _real(0, 1)
+    target_entropy: float = _real()
+    target_update_rate: float = _real(0, 1, open_low=True)
+    # the posterior over policies
+    real_ratio: float = _real(0, 1)
+    temperature: float = _real(0, open_low=True)
+
+    @property
+    def n_members(self) -> int:
+        """N·M, the policies that the posterior draws from."""
+        return self.n_models * self.n_policies
+
+    @property
+    def refreshes_per_epoch(self) -> int:
+        return self.epoch_steps // self.model_update_every
+
+    @property
+    def validation_block(self) -> int:
+        """k, when one row in k validates: the split draws one row of every k consecutive ones."""
+        return round(1 / self.validation_ratio)
+
+
+FIELDS = {field.name: field for field in dataclasses.fields(Settings)}
+
+# Settings that a resumed run may change: they steer the loop around the run, not what it computes.
+CHANGEABLE = frozenset({"total_steps", "eval_episodes", "eval_policy", "checkpoint_every", "devices", "compile_cache"})
+
+
+def allowed(name: str) -> str:
+    """What the setting `name` may be, in words."""
+    field = FIELDS[name]
+    if choices := field.metadata.get("choices"):
+        return "one of " + ", ".join(choices)
+    kind = {int: "a whole number", float: "a number", bool: "true or false", str: "a name"}[field.type]
+    low, high = field.metadata.get("range", (None, None))
+    above = "above" if field.metadata.get("open_low") else "at least"
+    if low is not None and high is not None:
+        return f"{kind} from {low} to {high}" if above == "at least" else f"{kind} above {low} and at most {high}"
+    return kind if low is None else f"{kind}, {above} {low}"
+
+
+def check(name: str, value: Any) -> Any:
+    """`value` as the type of the setting `name`.
+
+    Raises:
+        SettingError: the value has the wrong type or lies out of range.
+    """
+    field = FIELDS[name]
+    complaint = SettingError(f"{name}={value}: must be {allowed(name)}")
+    if field.type is bool:
+        if not isinstance(value, bool):
+            raise complaint
+        return value
+    if field.type is str:
+        if not isinstance(value, str) or value not in field.metadata.get("choices", (value,)):
+            raise complaint
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise complaint from None
+    if isinstance(value, bool) or math.isnan(number):
+        raise complaint
+    if field.type is int:
+        if not math.isfinite(number) or number != int(number):
+            raise complaint
+        number = int(number)
+    elif math.isinf(number) and name != "temperature":  # τ = ∞ is uniform sampling, equation 18
+        raise complaint
+    low, high = field.metadata.get("range", (None, None))
+    too_low = low is not None and (number < low or (number == low and field.metadata.get("open_low", False)))
+    if too_low or (high is not None and number > high):
+        raise complaint
+    return number
+
+
+def build(values: Mapping[str, Any]) -> Settings:
+    """Settings from plain values, each checked, and checked against one another.
+
+    Raises:
+        SettingError: a value is wrong, or two contradict.
+    """
+    settings = Settings(**{name: check(name, values[name]) for name in FIELDS})
+    if settings.epoch_steps % settings.model_update_every:
+        raise SettingError(
+            f"model_update_every={settings.model_update_every}: must divide epoch_steps={settings.epoch_steps}"
+        )
+    if settings.total_steps % settings.epoch_steps:
+        raise SettingError(
+            f"total_steps={settings.total_steps}: must be a multiple of epoch_steps={settings.epoch_steps}"
+        )
+    if settings.horizon_ramp_end <= settings.horizon_ramp_start:
+        raise SettingError("horizon_ramp_end: must be greater than horizon_ramp_start")
+    if settings.warmup_steps < settings.validation_block:
+        raise SettingError(
+            f"warmup_steps={settings.warmup_steps}: must be at least 1 / validation_ratio = {settings.validation_block}"
+        )
+    if settings.replay_capacity < settings.warmup_steps:
+        raise SettingError(f"replay_capacity={settings.replay_capacity}: must be at least warmup_steps")
+    return settings

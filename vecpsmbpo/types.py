@@ -1,0 +1,224 @@
+"""The values that pass between the rooms of this program.
+
+Axes, by the same letters everywhere: S seeds, N models, M policies per model, P = N·M members (rounded up to
+the mesh, see `layout`), B batch, T time, O observation, A action, C buffer capacity, F packed row.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+from flax import struct
+
+from vecpsmbpo.settings import Settings
+
+Params = Any  # a pytree of arrays
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """What a task is, apart from its simulator.
+
+    Attributes:
+        name: the task's name, as in `env=`.
+        obs_size: O.
+        action_size: A; actions lie in [-1, 1].
+        episode_length: control steps after which an episode is truncated.
+        terminated: (obs [..., O], action [..., A], next_obs [..., O]) -> bool [...]. The task's own termination
+            rule as a function of observations; imagined rollouts end by it.
+    """
+
+    name: str
+    obs_size: int
+    action_size: int
+    episode_length: int
+    terminated: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+
+
+class Transition(NamedTuple):
+    """(s, a, r, s', terminated). `next_obs` is the true successor, also where the episode ended.
+
+    Shapes: obs [..., O], action [..., A], reward [...], next_obs [..., O], terminated [...] in {0, 1}.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    next_obs: jax.Array
+    terminated: jax.Array
+
+
+@struct.dataclass
+class Hyper:
+    """What may be swept as a number: traced leaves, scalars here and [S] in a train state."""
+
+    model_learning_rate: jax.Array
+    model_weight_decay: jax.Array
+    policy_learning_rate: jax.Array
+    discount: jax.Array
+    target_entropy: jax.Array
+    target_update_rate: jax.Array
+    real_ratio: jax.Array
+    temperature: jax.Array
+
+    @classmethod
+    def of(cls, settings: Settings) -> "Hyper":
+        return cls(**{name: jax.numpy.float32(getattr(settings, name)) for name in cls.__dataclass_fields__})
+
+
+@struct.dataclass
+class Model:
+    """One dynamics model.
+
+    Attributes:
+        params: of `networks.GaussianMLP`.
+        optimizer: state of Adam; it lives on from refit to refit.
+        input_mean, input_std: [O + A], of the data that the model was last fitted on (equation 20).
+        loss: [], mean negative log-likelihood (equation 17) over the last epoch of the last fit.
+        val_mse: [], validation mean squared error of the parameters kept.
+    """
+
+    params: Params
+    optimizer: Any
+    input_mean: jax.Array
+    input_std: jax.Array
+    loss: jax.Array
+    val_mse: jax.Array
+
+
+@struct.dataclass
+class AgentStats:
+    """Sums over this epoch's SAC updates of one member; every leaf []."""
+
+    updates: jax.Array
+    critic_loss: jax.Array
+    actor_loss: jax.Array
+    alpha: jax.Array
+    q_mean: jax.Array
+    entropy: jax.Array
+
+
+@struct.dataclass
+class Agent:
+    """One soft actor-critic: networks, target, temperature α, and the state of Adam for each."""
+
+    actor: Params
+    critic: Params
+    target_critic: Params
+    log_alpha: jax.Array
+    actor_optimizer: Any
+    critic_optimizer: Any
+    alpha_optimizer: Any
+    stats: AgentStats
+
+
+@struct.dataclass
+class Posterior:
+    """q(π | D, λ), as far as it has memory: what each member has earned.
+
+    Attributes:
+        returns: [N·M], sum of the returns of each member's finished, non-random episodes (equation 19).
+        compensation: [N·M], low-order part of `returns` that float32 addition lost (Kahan).
+    """
+
+    returns: jax.Array
+    compensation: jax.Array
+
+
+@struct.dataclass
+class Episode:
+    """The real episode that is running.
+
+    Attributes:
+        index: [] int, k from 1.
+        member: [] int, n·M + m of the acting policy.
+        random: [] bool, actions are uniform and the return is not credited.
+        probs: [N·M], the distribution that `member` was drawn from.
+        episode_return, length: [] so far.
+    """
+
+    index: jax.Array
+    member: jax.Array
+    random: jax.Array
+    probs: jax.Array
+    episode_return: jax.Array
+    length: jax.Array
+
+
+@struct.dataclass
+class EpisodeEnd:
+    """One real step's news for `episodes.jsonl`: meaningful where `done`. Every leaf [] but probs [N·M]."""
+
+    done: jax.Array
+    index: jax.Array
+    member: jax.Array
+    random: jax.Array
+    terminated: jax.Array
+    episode_return: jax.Array
+    length: jax.Array
+    probs: jax.Array
+
+
+@struct.dataclass
+class Moments:
+    """Running mean and sum of squared deviations of (observation, action) over D_E, [O + A] each (Welford)."""
+
+    mean: jax.Array
+    deviation: jax.Array
+
+
+@struct.dataclass
+class SeedState:
+    """Everything one seed owns. In a train state every leaf has a leading [S]; models, agents and imagined data
+    have their member axis next and are spread over the mesh along it.
+
+    Attributes:
+        key: typed PRNG key.
+        hyper: see `Hyper`.
+        models: `Model` with leading [N].
+        agents: `Agent` with leading [P].
+        real: [C, F], D_E: packed transitions, a ring.
+        imagined: [P, C_M, F], D_M^{n,m}: one ring per member.
+        moments: of D_E, for whitening.
+        posterior, episode: who acts, and how it is going.
+        epoch_return, epoch_episodes: [], sum and number of the returns of the episodes that ended this epoch.
+    """
+
+    key: jax.Array
+    hyper: Hyper
+    models: Model
+    agents: Agent
+    real: jax.Array
+    imagined: jax.Array
+    moments: Moments
+    posterior: Posterior
+    episode: Episode
+    epoch_return: jax.Array
+    epoch_episodes: jax.Array
+
+
+class Counters(NamedTuple):
+    """Shared by all seeds, since every seed adds one row per step: ring positions stay unbatched under `vmap`, so
+    that writing a row is an in-place update and not a scatter.
+
+    Shapes: [] int32 each.
+    """
+
+    env_steps: jax.Array
+    imagined_rows: jax.Array
+
+
+@struct.dataclass
+class TrainState:
+    """A run between two chunks.
+
+    Attributes:
+        counters: see `Counters`.
+        seeds: `SeedState` with leading [S].
+        env: state of the MJX environments with leading [S], or the current observations [S, O] of host ones.
+    """
+
+    counters: Counters
+    seeds: SeedState
+    env: Any
