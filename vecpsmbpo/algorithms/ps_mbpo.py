@@ -13,6 +13,7 @@ from vecpsmbpo import dynamics, imagination, posterior, replay, sac
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import (
+    Agent,
     Counters,
     EnvSpec,
     Episode,
@@ -139,17 +140,22 @@ class PsMbpo:
     def begin_epoch(self, counters: Counters, state: SeedState) -> SeedState:
         """Clears the epoch's sums when an epoch begins."""
         fresh = counters.env_steps % self.settings.epoch_steps == 0
-        cleared = lambda tree: jax.tree.map(lambda x: jnp.where(fresh, jnp.zeros_like(x), x), tree)  # noqa: E731
+
+        def cleared(tree):
+            return jax.tree.map(lambda x: jnp.where(fresh, jnp.zeros_like(x), x), tree)
+
         return state.replace(
             agents=state.agents.replace(stats=cleared(state.agents.stats)),
             epoch_return=cleared(state.epoch_return),
             epoch_episodes=cleared(state.epoch_episodes),
         )
 
-    def fit_models(self, counters: Counters, state: SeedState, enabled: jax.Array) -> SeedState:
+    def fit_models(
+        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+    ) -> SeedState:
         """Refits every model on D_E (Algorithm 1, line 2); zero epochs where not `enabled`."""
         settings, spec = self.settings, self.spec
-        key, split_key, fit_key = jax.random.split(state.key, 3)
+        split_key, fit_key = jax.random.split(key)
         rows = counters.env_steps
         split = dynamics.Split.draw(split_key, rows, settings.replay_capacity, settings.validation_block)
         whitening = dynamics.scaling(state.moments, rows)
@@ -169,9 +175,11 @@ class PsMbpo:
             )
 
         keys = self.layout.keys(fit_key, self.layout.model_ids())
-        return state.replace(key=key, models=self.layout.map_local(fit, state.models, keys))
+        return state.replace(models=self.layout.map_local(fit, state.models, keys))
 
-    def imagine(self, counters: Counters, state: SeedState, enabled: jax.Array) -> SeedState:
+    def imagine(
+        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+    ) -> SeedState:
         """Rolls every member (n, m) out in model n from real states (lines 9 and 10), into its own ring.
 
         Adds `imagined_rows` rows to every ring: a row whose rollout terminates goes on from a fresh real state, so
@@ -181,7 +189,6 @@ class PsMbpo:
         chunk = imagination.chunk_size(settings)
         horizon = imagination.horizon(settings, counters.env_steps)
         chunks = jnp.where(enabled, imagination.chunks_per_refresh(settings, horizon), 0)
-        key, rollout_key = jax.random.split(state.key)
         models, ids = layout.models_of_members(state.models), layout.member_ids()
 
         def real_states(key):
@@ -202,13 +209,13 @@ class PsMbpo:
 
         def rollout(c, carry):
             imagined, rows = carry
-            start_key, key = jax.random.split(jax.random.fold_in(rollout_key, c))
+            start_key, step_key = jax.random.split(jax.random.fold_in(key, c))
             obs = jax.vmap(real_states)(layout.keys(start_key, ids))
-            imagined, _, rows, _ = jax.lax.fori_loop(0, horizon, step, (imagined, obs, rows, key))
+            imagined, _, rows, _ = jax.lax.fori_loop(0, horizon, step, (imagined, obs, rows, step_key))
             return imagined, rows
 
         imagined, _ = jax.lax.fori_loop(0, chunks, rollout, (state.imagined, counters.imagined_rows))
-        return state.replace(key=key, imagined=imagined)
+        return state.replace(imagined=imagined)
 
     def imagined_rows(self, counters: Counters, enabled: jax.Array) -> jax.Array:
         """The counter of `counters` after `imagine`."""
@@ -219,10 +226,10 @@ class PsMbpo:
 
     # ── learn: every step ────────────────────────────────────────────────────────────────────────────────────
 
-    def learn(self, counters: Counters, state: SeedState) -> SeedState:
-        """G SAC updates of every member on λ D_E + (1 - λ) D_M^{n,m} (lines 11 and 12)."""
+    def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Agent:
+        """The agents after G SAC updates of every member on λ D_E + (1 - λ) D_M^{n,m} (lines 11 and 12)."""
         layout, nets = self.layout, sac.make_networks(self.settings, self.spec)
-        key, batch_key, update_key = jax.random.split(state.key, 3)
+        batch_key, update_key = jax.random.split(key)
         ids = layout.member_ids()
         # Minibatches of all members are gathered at once and before the loop over members: looping over the rings
         # themselves would copy each of them whole.
@@ -233,8 +240,7 @@ class PsMbpo:
         def update(agent, batches, key):
             return sac.updates(agent, batches, state.hyper, key, nets=nets)
 
-        agents = layout.map_local(update, state.agents, batches, layout.keys(update_key, ids))
-        return state.replace(key=key, agents=agents)
+        return layout.map_local(update, state.agents, batches, layout.keys(update_key, ids))
 
     def minibatches(
         self, counters: Counters, state: SeedState, imagined: jax.Array, key: jax.Array

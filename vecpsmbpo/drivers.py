@@ -1,0 +1,330 @@
+"""Steps real environments with an algorithm: as one compiled program (MJX), or with a simulator on the host.
+
+Both go through the same functions of the algorithm in the same order. A period is `model_update_every` steps: it
+begins with a refresh (models refitted, imagination renewed); then every step acts, observes and learns. A chunk is a
+whole number of periods, decided when the program is called: one compiled program serves chunks of any length.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec
+
+from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
+from vecpsmbpo.envs.host.batched import HostEnv
+from vecpsmbpo.layout import SEEDS
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
+
+_SHARED, _BY_SEED = PartitionSpec(), PartitionSpec(SEEDS)
+_LOG = PartitionSpec(None, None, SEEDS)
+
+
+class Returns(NamedTuple):
+    """Of evaluation episodes, [S, E] each."""
+
+    episode_return: np.ndarray
+    length: np.ndarray
+
+
+class Driver(Protocol):
+    """What `train` and `evaluate` need of a driver."""
+
+    compile_seconds: float
+
+    def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        """The state before the first step, laid out on the mesh. keys [S], hyper leaves [S]."""
+
+    def compile(self, state: TrainState) -> None:
+        """Builds the programs, so that the first chunk does not have to."""
+
+    def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:
+        """A chunk. The state given is consumed. The news have leaves [periods * model_update_every, S, ...]."""
+
+    def evaluate(self, state: TrainState, key: jax.Array, episodes: int) -> Returns:
+        """Whole episodes of the evaluation policy, in environments of their own."""
+
+    def save_env(self) -> dict[str, Any]:
+        """State of simulators that is not part of the train state, in JSON's types."""
+
+    def load_env(self, saved: dict[str, Any]) -> None:
+        """The inverse of `save_env`."""
+
+
+# ── what both drivers run, for this device's share ───────────────────────────────────────────────────────────────
+
+
+def over_seeds(function: Callable) -> Callable:
+    """`function` of (counters, state of one seed, ...) for every seed of this device; counters are shared."""
+
+    def batched(counters, *args):
+        return jax.vmap(lambda *one: function(counters, *one))(*args)
+
+    return batched
+
+
+def begin_period(algorithm: PsMbpo, state: TrainState) -> tuple[TrainState, jax.Array]:
+    """Refreshes models and imagined data, and says whether this period learns: not before the warm-up is over.
+
+    Where every seed learns from real data alone (λ = 1, equation 15), models are not needed and not
+    fitted.
+    """
+    counters, seeds = state.counters, state.seeds
+    learning = counters.env_steps >= algorithm.settings.warmup_steps
+    imagining = learning & algorithm.layout.any_seed(seeds.hyper.real_ratio < 1)
+    seeds, keys = split_keys(seeds, 2)
+    seeds = over_seeds(algorithm.begin_epoch)(counters, seeds)
+    seeds = over_seeds(lambda c, s, k: algorithm.fit_models(c, s, imagining, k))(counters, seeds, keys[:, 0])
+    seeds = over_seeds(lambda c, s, k: algorithm.imagine(c, s, imagining, k))(counters, seeds, keys[:, 1])
+    counters = counters._replace(imagined_rows=algorithm.imagined_rows(counters, imagining))
+    return state.replace(counters=counters, seeds=seeds), learning
+
+
+def split_keys(seeds: SeedState, count: int) -> tuple[SeedState, jax.Array]:
+    """Takes `count` keys [S, count] from every seed's own."""
+    keys = jax.vmap(lambda key: jax.random.split(key, count + 1))(seeds.key)
+    return seeds.replace(key=keys[:, 0]), keys[:, 1:]
+
+
+def observe_and_learn(
+    algorithm: PsMbpo,
+    counters: Counters,
+    seeds: SeedState,
+    transition: Transition,
+    truncated: jax.Array,
+    keys: jax.Array,
+    learning: jax.Array,
+) -> tuple[Counters, SeedState, EpisodeEnd]:
+    """What follows every real step. transition leaves [S, ...], truncated [S], keys [S, 2]."""
+    seeds, end = over_seeds(algorithm.observe)(counters, seeds, transition, truncated, keys[:, 0])
+    counters = counters._replace(env_steps=counters.env_steps + 1)
+    # Only the agents go through the branch: a conditional that returned the buffers would copy them.
+    agents = jax.lax.cond(
+        learning,
+        lambda seeds: over_seeds(algorithm.learn)(counters, seeds, keys[:, 1]),
+        lambda seeds: seeds.agents,
+        seeds,
+    )
+    return counters, seeds.replace(agents=agents), end
+
+
+# ── MJX: everything in one program ───────────────────────────────────────────────────────────────────────────────
+
+
+class ScanDriver:
+    """Real steps, refits, rollouts and updates as one compiled program over the mesh."""
+
+    def __init__(self, algorithm: PsMbpo, env: Any):
+        self.algorithm, self.env = algorithm, env
+        self.settings: Settings = algorithm.settings
+        self.layout = algorithm.layout
+        self.compile_seconds = 0.0
+        specs = self.layout.specs()
+        self._init = self.layout.spread(self._init_local, (_BY_SEED, _BY_SEED), specs)
+        self._run = self.layout.spread(
+            self._run_local, (specs, _SHARED), (specs, _LOG), donate_argnums=0
+        )
+        self._evaluate = self.layout.spread(
+            self._evaluate_local, (specs.seeds, _BY_SEED), (_BY_SEED, _BY_SEED)
+        )
+        self._compiled: Any = None
+
+    def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        return self._init(keys, hyper)
+
+    def compile(self, state: TrainState) -> None:
+        began = time.perf_counter()
+        self._compiled = self._run.lower(state, jnp.int32(1)).compile()
+        self.compile_seconds = time.perf_counter() - began
+
+    def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:
+        state, log = (self._compiled or self._run)(state, jnp.int32(periods))
+        flat = jax.tree.map(lambda x: np.asarray(x[:periods]).reshape(-1, *x.shape[2:]), log)
+        return state, flat
+
+    def evaluate(self, state: TrainState, key: jax.Array, episodes: int) -> Returns:
+        keys = jax.random.split(key, (self.settings.num_seeds, episodes + 1))
+        return Returns(*map(np.asarray, self._evaluate(state.seeds, keys)))
+
+    def save_env(self) -> dict[str, Any]:
+        return {}  # the environments are part of the train state
+
+    def load_env(self, saved: dict[str, Any]) -> None:
+        pass
+
+    def _init_local(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        split = jax.vmap(jax.random.split)(keys)
+        counters = Counters(env_steps=jnp.int32(0), imagined_rows=jnp.int32(0))
+        return TrainState(
+            counters=counters,
+            seeds=jax.vmap(self.algorithm.init)(split[:, 0], hyper),
+            env=jax.vmap(self.env.reset)(split[:, 1]),
+        )
+
+    def _run_local(self, state: TrainState, periods: jax.Array) -> tuple[TrainState, EpisodeEnd]:
+        settings = self.settings
+
+        def period(index, carry):
+            state, log = carry
+            state, learning = begin_period(self.algorithm, state)
+            step = lambda state, _: self._step(state, learning)  # noqa: E731
+            state, news = jax.lax.scan(step, state, None, length=settings.model_update_every)
+            return state, jax.tree.map(lambda all_, new: all_.at[index].set(new), log, news)
+
+        news = jax.eval_shape(lambda s: self._step(s, jnp.bool_(True))[1], state)
+        shape = (settings.refreshes_per_epoch, settings.model_update_every)
+        log = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), news)
+        return jax.lax.fori_loop(0, periods, period, (state, log))
+
+    def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
+        """One real step of every seed's environment, and what follows it."""
+        seeds, keys = split_keys(state.seeds, 4)
+        obs = state.env.obs
+        action = jax.vmap(self.algorithm.act)(seeds, obs, keys[:, 0])
+        env = jax.vmap(self.env.step)(state.env, action)
+        transition = Transition(obs, action, env.reward, env.obs, env.done)
+        truncated = (seeds.episode.length + 1 >= self.settings.episode_length) & (env.done == 0)
+        counters, seeds, end = observe_and_learn(
+            self.algorithm, state.counters, seeds, transition, truncated, keys[:, 1:3], learning
+        )
+        fresh = jax.vmap(self.env.reset)(keys[:, 3])
+        env = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(end.done, new, old), fresh, env)
+        return TrainState(counters, seeds, env), end
+
+    def _evaluate_local(self, seeds: SeedState, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def one_seed(seed, keys):
+            policy = self.algorithm.evaluation_policy(seed, keys[0])
+
+            def step(carry):
+                t, env, total, length, alive = carry
+                action = jax.vmap(lambda obs: self.algorithm.act_greedily(policy, obs))(env.obs)
+                env = jax.vmap(self.env.step)(env, action)
+                total = total + jnp.where(alive, env.reward, 0.0)
+                return t + 1, env, total, length + alive, alive & (env.done == 0)
+
+            def running(carry):
+                t, *_, alive = carry
+                return (t < self.settings.episode_length) & jnp.any(alive)
+
+            count = keys.shape[0] - 1
+            start = jax.vmap(self.env.reset)(keys[1:])
+            carry = (0, start, jnp.zeros(count), jnp.zeros(count, jnp.int32), jnp.ones(count, bool))
+            _, _, total, length, _ = jax.lax.while_loop(running, step, carry)
+            return total, length
+
+        return jax.vmap(one_seed)(seeds, keys)
+
+
+# ── a simulator on the host ──────────────────────────────────────────────────────────────────────────────────────
+
+
+class HostDriver:
+    """The same functions, jitted one by one, with a simulator stepped between them."""
+
+    def __init__(self, algorithm: PsMbpo, make_env: Callable[..., HostEnv]):
+        """
+        Args:
+            make_env: (num_envs, seed) -> the batched environment.
+        """
+        self.algorithm = algorithm
+        self.settings: Settings = algorithm.settings
+        self.layout = algorithm.layout
+        self.compile_seconds = 0.0
+        self._make_env = make_env
+        self._env = make_env(num_envs=self.settings.num_seeds, seed=self.settings.seed)
+        self._env.episode_length = self.settings.episode_length
+        specs, seeds = self.layout.specs(), self.layout.specs().seeds
+        spread = self.layout.spread
+        self._init = spread(self._init_local, (_BY_SEED, _BY_SEED, _BY_SEED), specs)
+        self._begin = spread(
+            lambda state: begin_period(algorithm, state), (specs,), (specs, _SHARED), donate_argnums=0
+        )
+        self._act = spread(self._act_local, (seeds, _BY_SEED), (_BY_SEED, _BY_SEED))
+        self._observe = spread(
+            self._observe_local,
+            (specs, _BY_SEED, _BY_SEED, _BY_SEED, _BY_SEED, _SHARED),
+            (specs, _BY_SEED),
+            donate_argnums=0,
+        )
+        self._policy = spread(jax.vmap(algorithm.evaluation_policy), (seeds, _BY_SEED), _BY_SEED)
+        self._act_greedily = spread(
+            jax.vmap(jax.vmap(algorithm.act_greedily, in_axes=(None, 0))), (_BY_SEED, _BY_SEED), _BY_SEED
+        )
+
+    def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        return self._init(keys, hyper, jnp.asarray(self._env.reset()))
+
+    def compile(self, state: TrainState) -> None:
+        pass  # each function is compiled when it is first needed
+
+    def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:
+        news = []
+        for _ in range(periods):
+            state, learning = self._begin(state)
+            for _ in range(self.settings.model_update_every):
+                state, end = self._step(state, learning)
+                news.append(end)
+        return state, jax.tree.map(lambda *xs: np.stack(xs), *news)
+
+    def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
+        obs = state.env
+        action, keys = self._act(state.seeds, obs)
+        step = self._env.step(np.asarray(action))
+        transition = Transition(
+            obs, action, step.reward, step.next_obs, np.asarray(step.terminated, np.float32)
+        )
+        state, end = self._observe(state, transition, step.truncated, keys, step.obs, learning)
+        return state, jax.tree.map(np.asarray, end)
+
+    def evaluate(self, state: TrainState, key: jax.Array, episodes: int) -> Returns:
+        seeds, obs_size = self.settings.num_seeds, self.algorithm.spec.obs_size
+        policy_key, env_key = jax.random.split(key)
+        policy = self._policy(state.seeds, jax.random.split(policy_key, seeds))
+        env_seed = int(jax.random.randint(env_key, (), 0, 2**30))
+        env = self._make_env(num_envs=seeds * episodes, seed=env_seed)
+        env.episode_length = self.settings.episode_length
+        obs = env.reset()
+        total, length, alive = (np.zeros(seeds * episodes), np.zeros(seeds * episodes, int), np.ones(seeds * episodes, bool))
+        while alive.any():
+            action = self._act_greedily(policy, obs.reshape(seeds, episodes, obs_size))
+            step = env.step(np.asarray(action).reshape(seeds * episodes, -1))
+            obs = step.obs
+            total += np.where(alive, step.reward, 0.0)
+            length += alive
+            alive &= ~(step.terminated | step.truncated)
+        return Returns(total.reshape(seeds, episodes), length.reshape(seeds, episodes))
+
+    def save_env(self) -> dict[str, Any]:
+        return self._env.save()
+
+    def load_env(self, saved: dict[str, Any]) -> None:
+        self._env.load(saved)
+
+    def _init_local(self, keys: jax.Array, hyper: Hyper, obs: jax.Array) -> TrainState:
+        counters = Counters(env_steps=jnp.int32(0), imagined_rows=jnp.int32(0))
+        return TrainState(counters, jax.vmap(self.algorithm.init)(keys, hyper), obs)
+
+    def _act_local(self, seeds: SeedState, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        # The key is not advanced here but in `_observe_local`, which splits the same one: acting needs no copy of
+        # the state, and changes nothing.
+        _, keys = split_keys(seeds, 3)
+        return jax.vmap(self.algorithm.act)(seeds, obs, keys[:, 0]), keys[:, 1:]
+
+    def _observe_local(
+        self,
+        state: TrainState,
+        transition: Transition,
+        truncated: jax.Array,
+        keys: jax.Array,
+        obs: jax.Array,
+        learning: jax.Array,
+    ) -> tuple[TrainState, EpisodeEnd]:
+        seeds, _ = split_keys(state.seeds, 3)
+        counters, seeds, end = observe_and_learn(
+            self.algorithm, state.counters, seeds, transition, truncated, keys, learning
+        )
+        return TrainState(counters, seeds, obs), end
