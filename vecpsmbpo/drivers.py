@@ -7,6 +7,7 @@ whole number of periods, decided when the program is called: one compiled progra
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -16,7 +17,7 @@ from jax.sharding import PartitionSpec
 
 from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
 from vecpsmbpo.envs.host.batched import HostEnv
-from vecpsmbpo.layout import SEEDS
+from vecpsmbpo.layout import SEEDS, Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
 
@@ -34,6 +35,8 @@ class Returns(NamedTuple):
 class Driver(Protocol):
     """What `train` and `evaluate` need of a driver."""
 
+    algorithm: PsMbpo
+    layout: Layout
     compile_seconds: float
 
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
@@ -45,8 +48,8 @@ class Driver(Protocol):
     def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:
         """A chunk. The state given is consumed. The news have leaves [periods * model_update_every, S, ...]."""
 
-    def evaluate(self, state: TrainState, key: jax.Array, episodes: int) -> Returns:
-        """Whole episodes of the evaluation policy, in environments of their own."""
+    def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
+        """Whole episodes of the evaluation policy, in environments of their own. keys [S]."""
 
     def save_env(self) -> dict[str, Any]:
         """State of simulators that is not part of the train state, in JSON's types."""
@@ -132,13 +135,17 @@ class ScanDriver:
             self._evaluate_local, (specs.seeds, _BY_SEED), (_BY_SEED, _BY_SEED)
         )
         self._compiled: Any = None
+        self._compiled_evaluate: Any = None
 
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         return self._init(keys, hyper)
 
     def compile(self, state: TrainState) -> None:
         began = time.perf_counter()
-        self._compiled = self._run.lower(state, jnp.int32(1)).compile()
+        keys = jax.eval_shape(lambda key: _split(key, self.settings.eval_episodes), state.seeds.key)
+        lowered = (self._run.lower(state, jnp.int32(1)), self._evaluate.lower(state.seeds, keys))
+        with ThreadPoolExecutor() as pool:  # XLA compiles outside of Python's lock: together they cost the longer one
+            self._compiled, self._compiled_evaluate = pool.map(lambda program: program.compile(), lowered)
         self.compile_seconds = time.perf_counter() - began
 
     def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:
@@ -146,9 +153,9 @@ class ScanDriver:
         flat = jax.tree.map(lambda x: np.asarray(x[:periods]).reshape(-1, *x.shape[2:]), log)
         return state, flat
 
-    def evaluate(self, state: TrainState, key: jax.Array, episodes: int) -> Returns:
-        keys = jax.random.split(key, (self.settings.num_seeds, episodes + 1))
-        return Returns(*map(np.asarray, self._evaluate(state.seeds, keys)))
+    def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
+        program = self._compiled_evaluate if episodes == self.settings.eval_episodes else None
+        return Returns(*map(np.asarray, (program or self._evaluate)(state.seeds, _split(keys, episodes))))
 
     def save_env(self) -> dict[str, Any]:
         return {}  # the environments are part of the train state
@@ -175,9 +182,8 @@ class ScanDriver:
             state, news = jax.lax.scan(step, state, None, length=settings.model_update_every)
             return state, jax.tree.map(lambda all_, new: all_.at[index].set(new), log, news)
 
-        news = jax.eval_shape(lambda s: self._step(s, jnp.bool_(True))[1], state)
-        shape = (settings.refreshes_per_epoch, settings.model_update_every)
-        log = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), news)
+        shape = (settings.refreshes_per_epoch, settings.model_update_every, state.env.obs.shape[0])
+        log = EpisodeEnd.blank(shape, settings.n_members)
         return jax.lax.fori_loop(0, periods, period, (state, log))
 
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
@@ -217,6 +223,11 @@ class ScanDriver:
             return total, length
 
         return jax.vmap(one_seed)(seeds, keys)
+
+
+def _split(keys: jax.Array, episodes: int) -> jax.Array:
+    """Keys [S] -> [S, 1 + E]: one for the policy, one for each episode."""
+    return jax.vmap(lambda key: jax.random.split(key, 1 + episodes))(keys)
 
 
 # ── a simulator on the host ──────────────────────────────────────────────────────────────────────────────────────
@@ -280,18 +291,19 @@ class HostDriver:
         state, end = self._observe(state, transition, step.truncated, keys, step.obs, learning)
         return state, jax.tree.map(np.asarray, end)
 
-    def evaluate(self, state: TrainState, key: jax.Array, episodes: int) -> Returns:
+    def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
         seeds, obs_size = self.settings.num_seeds, self.algorithm.spec.obs_size
-        policy_key, env_key = jax.random.split(key)
-        policy = self._policy(state.seeds, jax.random.split(policy_key, seeds))
-        env_seed = int(jax.random.randint(env_key, (), 0, 2**30))
+        split = _split(keys, episodes)
+        policy = self._policy(state.seeds, split[:, 0])
+        env_seed = int(jax.random.randint(split[0, 1], (), 0, 2**30))
         env = self._make_env(num_envs=seeds * episodes, seed=env_seed)
         env.episode_length = self.settings.episode_length
         obs = env.reset()
-        total, length, alive = (np.zeros(seeds * episodes), np.zeros(seeds * episodes, int), np.ones(seeds * episodes, bool))
+        count = seeds * episodes
+        total, length, alive = np.zeros(count), np.zeros(count, int), np.ones(count, bool)
         while alive.any():
             action = self._act_greedily(policy, obs.reshape(seeds, episodes, obs_size))
-            step = env.step(np.asarray(action).reshape(seeds * episodes, -1))
+            step = env.step(np.asarray(action).reshape(count, -1))
             obs = step.obs
             total += np.where(alive, step.reward, 0.0)
             length += alive

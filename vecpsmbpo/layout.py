@@ -148,14 +148,18 @@ class Layout:
         body = jax.shard_map(
             function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
         )
-        return jax.jit(body, **jit)
+        # Shardings are stated, not inferred, so that a fresh and a resumed run are one program to the cache.
+        return jax.jit(body, in_shardings=self._placed(in_specs), out_shardings=self._placed(out_specs), **jit)
+
+    def _placed(self, specs: Any) -> Any:
+        return jax.tree.map(
+            lambda spec: NamedSharding(self.mesh, spec), specs, is_leaf=lambda x: isinstance(x, PartitionSpec)
+        )
 
     def shardings(self, state: TrainState) -> TrainState:
         """A sharding per leaf of `state` (arrays or shapes)."""
         specs = jax.tree.broadcast(self.specs(), state, is_leaf=lambda x: isinstance(x, PartitionSpec))
-        return jax.tree.map(
-            lambda spec: NamedSharding(self.mesh, spec), specs, is_leaf=lambda x: isinstance(x, PartitionSpec)
-        )
+        return self._placed(specs)
 
     def unpad(self, state: TrainState) -> TrainState:
         """`state` without the padding members and models: what a checkpoint holds, whatever mesh it came from."""

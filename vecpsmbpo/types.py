@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from vecpsmbpo.settings import Settings
@@ -64,7 +65,7 @@ class Hyper:
 
     @classmethod
     def of(cls, settings: Settings) -> "Hyper":
-        return cls(**{name: jax.numpy.float32(getattr(settings, name)) for name in cls.__dataclass_fields__})
+        return cls(**{name: jnp.float32(getattr(settings, name)) for name in cls.__dataclass_fields__})
 
 
 @struct.dataclass
@@ -158,6 +159,13 @@ class EpisodeEnd:
     episode_return: jax.Array
     length: jax.Array
     probs: jax.Array
+
+    @classmethod
+    def blank(cls, shape: tuple[int, ...], n_members: int) -> "EpisodeEnd":
+        """Room for the news of `shape` steps."""
+        flag, count, number = (jnp.zeros(shape, dtype) for dtype in (bool, jnp.int32, jnp.float32))
+        probs = jnp.zeros((*shape, n_members))
+        return cls(flag, count, count, flag, flag, number, count, probs)
 
 
 @struct.dataclass

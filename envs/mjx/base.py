@@ -10,6 +10,7 @@ from brax.envs.base import Env, State
 from flax import struct
 from mujoco import mjx
 
+from vecpsmbpo.envs.mjx import integrator
 from vecpsmbpo.types import EnvSpec
 
 
@@ -47,6 +48,7 @@ class MjxEnv(Env):
         self.substeps = substeps
         self._mjx_model = mjx.put_model(model, impl="jax")
         self._blank = mjx.make_data(model, impl="jax")
+        self._step = integrator.runge_kutta if integrator.loops_over_stages(model) else mjx.step
 
     # what a task defines
 
@@ -100,7 +102,7 @@ class MjxEnv(Env):
             data = self._blank.replace(
                 qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.warmstart, ctrl=control
             )
-            data = mjx.step(self._mjx_model, data)
+            data = self._step(self._mjx_model, data)
             return Physics(data.qpos, data.qvel, data.qacc_warmstart)
 
         if self.substeps == 1:

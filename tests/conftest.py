@@ -1,0 +1,20 @@
+"""Two CPU devices, as on the smallest machine the project is for, and one compilation cache for the whole session.
+
+The cache also serves the programs that tests start as subprocesses: what one compiled, the next one loads.
+"""
+
+import os
+import tempfile
+
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", os.path.join(tempfile.gettempdir(), "vecpsmbpo-tests-jax"))
+os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2 --xla_cpu_multi_thread_eigen=false"
+
+import jax
+import pytest
+
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@pytest.fixture
+def key() -> jax.Array:
+    return jax.random.key(0)

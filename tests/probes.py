@@ -1,0 +1,82 @@
+"""An environment whose value function is known in closed form, for both drivers.
+
+obs alternates 0, 1, 0, 1, …; at obs 1 the reward is 1 - a². With discount γ and the best action 0,
+
+    V(1) = 1 + γ V(0),  V(0) = γ V(1)   where episodes are only truncated: V(1) = 1 / (1 - γ²)
+    V(1) = 1,           V(0) = γ        where the step from obs 1 terminates.
+
+Taking a truncation for a termination, or the observation after a reset for the successor, changes the values.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import Env, State
+
+from vecpsmbpo.envs.host.batched import HostEnv, Simulator
+from vecpsmbpo.types import EnvSpec
+
+EPISODE_LENGTH = 3
+
+
+def spec(terminates: bool) -> EnvSpec:
+    def terminated(obs, action, next_obs):
+        return (obs[..., 0] > 0.5) & terminates
+
+    return EnvSpec("probe", obs_size=1, action_size=1, episode_length=EPISODE_LENGTH, terminated=terminated)
+
+
+class Probe(Env):
+    """In JAX, for the scan driver."""
+
+    def __init__(self, terminates: bool):
+        self.spec = spec(terminates)
+
+    def reset(self, rng: jax.Array) -> State:
+        return State(None, jnp.zeros(1), reward=jnp.zeros(()), done=jnp.zeros(()))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        reward = state.obs[0] * (1 - action[0] ** 2)
+        done = self.spec.terminated(state.obs, action, state.obs).astype(jnp.float32)
+        return state.replace(obs=1 - state.obs, reward=reward, done=done)
+
+    @property
+    def observation_size(self) -> int:
+        return 1
+
+    @property
+    def action_size(self) -> int:
+        return 1
+
+    @property
+    def backend(self) -> str:
+        return "none"
+
+
+class ProbeSimulator(Simulator):
+    """In numpy, for the host driver."""
+
+    def __init__(self, terminates: bool):
+        self._terminates = terminates
+        self._obs = 0.0
+
+    def reset(self) -> np.ndarray:
+        self._obs = 0.0
+        return np.array([0.0])
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+        reward, terminated = self._obs * (1 - action[0] ** 2), self._obs > 0.5 and self._terminates
+        self._obs = 1 - self._obs
+        return np.array([self._obs]), reward, terminated
+
+    def save(self) -> dict[str, Any]:
+        return {"obs": self._obs}
+
+    def load(self, saved: dict[str, Any]) -> None:
+        self._obs = saved["obs"]
+
+
+def host(terminates: bool, *, num_envs: int, seed: int) -> HostEnv:
+    return HostEnv(spec(terminates), [ProbeSimulator(terminates) for _ in range(num_envs)])

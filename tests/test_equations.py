@@ -1,0 +1,219 @@
+"""The paper's equations against values worked by hand, or by scipy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from tests.helpers import tiny
+from vecpsmbpo import dynamics, imagination, networks, posterior, sac
+from vecpsmbpo.envs import specs
+from vecpsmbpo.types import Hyper, Moments, Posterior, Transition
+
+
+def test_negative_log_likelihood_is_that_of_a_normal_without_its_constant():
+    # Equation 17 by hand: σ² = 4, y - μ = 3: log(4) / 2 + 9 / 8.
+    value = dynamics.negative_log_likelihood(jnp.array(1.0), jnp.log(4.0), jnp.array(4.0))
+    assert value == pytest.approx(np.log(4) / 2 + 9 / 8)
+    mean, log_variance, target = np.random.default_rng(0).normal(size=(3, 100))
+    expected = -scipy.stats.norm.logpdf(target, mean, np.exp(log_variance / 2)) - np.log(2 * np.pi) / 2
+    np.testing.assert_allclose(
+        dynamics.negative_log_likelihood(mean, log_variance, target), expected, rtol=1e-5
+    )
+
+
+def test_log_variance_is_clamped_softly(key):
+    net = networks.GaussianMLP(output_size=1, hidden_size=4, hidden_layers=1)
+    params = net.init(key, jnp.zeros(2))
+    head = jax.tree.map(jnp.zeros_like, params)
+
+    def log_variance(raw):
+        biased = jax.tree.map(lambda x: x, head)
+        biased["params"]["Dense_1"]["bias"] = jnp.array([0.0, raw])
+        return float(net.apply(biased, jnp.zeros(2))[1][0])
+
+    assert log_variance(1e3) == pytest.approx(2.0, abs=1e-3)
+    assert log_variance(-1e3) == pytest.approx(-10.0, abs=1e-3)
+    # A.1 by hand at raw = 0: 2 - softplus(2) = -0.126928; -10 + softplus(9.873072) = -0.126877.
+    assert log_variance(0.0) == pytest.approx(-0.126877, abs=1e-5)
+
+
+def test_prediction_adds_the_residual_to_the_state_and_whitens_its_inputs(key):
+    """Equations 20 and 21: with zero weights the outputs are the biases, whatever the input."""
+    settings, spec = tiny(), specs.get("hopper")
+    model = dynamics.init(key, settings, spec)
+    params = jax.tree.map(jnp.zeros_like, model.params)
+    size = spec.obs_size + 1
+    bias = jnp.concatenate([jnp.arange(size, dtype=jnp.float32), jnp.full(size, -1e3)])
+    params["params"]["Dense_2"]["bias"] = bias
+    net = dynamics.network(settings, spec)
+    obs, action = jnp.ones(spec.obs_size), jnp.zeros(spec.action_size)
+    next_obs, reward = dynamics.predict(model.replace(params=params), obs, action, key, net=net)
+    noise = 5 * np.exp(-5.0)  # five standard deviations at the lower bound of the variance
+    np.testing.assert_allclose(next_obs, 1 + np.arange(spec.obs_size), atol=noise)
+    assert reward == pytest.approx(spec.obs_size, abs=noise)
+
+    # Whitening: inputs (x - μ) / σ of shifted, scaled data are those of the data before.
+    shifted = model.replace(
+        input_mean=jnp.full(model.input_mean.shape, 3.0), input_std=jnp.full(model.input_std.shape, 2.0)
+    )
+    plain = dynamics.forward(model, obs, action, net=net)
+    moved = dynamics.forward(shifted, 3 + 2 * obs, 3 + 2 * action, net=net)
+    np.testing.assert_allclose(plain[0], moved[0], atol=1e-6)
+
+
+def test_whitening_uses_the_data_s_mean_and_standard_deviation():
+    rows = np.random.default_rng(0).normal(5.0, 3.0, size=(40, 2))
+    rows[:, 1] = 7.0  # never varies: left unscaled
+    moments = Moments(jnp.asarray(rows.mean(0)), jnp.asarray(((rows - rows.mean(0)) ** 2).sum(0)))
+    mean, std = dynamics.scaling(moments, jnp.int32(40))
+    np.testing.assert_allclose(mean, rows.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(std, [rows[:, 0].std(), 1.0], rtol=1e-5)
+
+
+def test_optimistic_probabilities_by_hand():
+    # Equation 19: returns 100, 300, 300, 0 at τ = 100: e^1, e^3, e^3, e^0 over their sum 43.8894.
+    earned = Posterior(jnp.array([100.0, 300.0, 300.0, 0.0]), jnp.zeros(4))
+    expected = np.exp([1, 3, 3, 0]) / np.exp([1, 3, 3, 0]).sum()
+    np.testing.assert_allclose(jax.nn.softmax(posterior.logits(earned, 100.0)), expected, rtol=1e-6)
+
+
+def test_infinite_temperature_is_uniform():
+    earned = Posterior(jnp.array([1e6, 0.0, -1e6]), jnp.zeros(3))
+    np.testing.assert_array_equal(jax.nn.softmax(posterior.logits(earned, jnp.inf)), np.full(3, 1 / 3, np.float32))
+
+
+def test_members_are_drawn_with_the_probabilities_of_equation_19():
+    earned = Posterior(jnp.array([10.0, 20.0, 0.0, 15.0]), jnp.zeros(4))
+    keys = jax.random.split(jax.random.key(1), 20_000)
+    members, probs = jax.vmap(lambda key: posterior.draw(earned, jnp.float32(10.0), key))(keys)
+    counts = np.bincount(members, minlength=4)
+    expected = np.asarray(probs[0], np.float64)
+    assert scipy.stats.chisquare(counts, expected / expected.sum() * 20_000).pvalue > 1e-3
+
+
+def test_accumulated_returns_stay_exact_over_thousands_of_episodes():
+    returns = np.random.default_rng(0).uniform(2900, 3100, 3000).astype(np.float32)
+
+    def add(earned, value):
+        return posterior.credit(earned, jnp.int32(1), value, jnp.bool_(True)), None
+
+    earned, _ = jax.lax.scan(add, posterior.init(3), jnp.asarray(returns))
+    exact = returns.astype(np.float64).sum()
+    logits = posterior.logits(earned, jnp.float32(15_000.0))
+    assert float(logits[1] - logits[0]) == pytest.approx(exact / 15_000, rel=1e-6)
+    assert earned.returns[0] == 0
+
+
+def test_only_the_acting_member_is_credited_and_only_when_it_counts():
+    earned = posterior.credit(posterior.init(3), jnp.int32(2), jnp.float32(5.0), jnp.bool_(True))
+    earned = posterior.credit(earned, jnp.int32(0), jnp.float32(7.0), jnp.bool_(False))
+    np.testing.assert_array_equal(earned.returns, [0, 0, 5])
+
+
+def test_tanh_gaussian_density_against_scipy(key):
+    loc, scale = jnp.array([0.3, -1.5, 0.0]), jnp.array([0.5, 0.1, 2.0])
+    keys = jax.random.split(key, 200)
+    action, log_prob = jax.vmap(networks.TanhGaussian(loc, scale).sample)(keys)
+    inner = np.abs(action).max(axis=1) < 0.999  # beyond, arctanh of a float32 says nothing
+    action = np.asarray(action, np.float64)[inner]
+    # Change of variables a = tanh(u): log p(a) = log N(arctanh a) - Σ log(1 - a²).
+    expected = scipy.stats.norm.logpdf(np.arctanh(action), loc, scale).sum(1) - np.log1p(-(action**2)).sum(1)
+    assert inner.sum() > 50
+    np.testing.assert_allclose(np.asarray(log_prob)[inner], expected, rtol=1e-3, atol=2e-3)
+
+
+def test_tanh_gaussian_density_is_finite_where_tanh_saturates(key):
+    action, log_prob = networks.TanhGaussian(jnp.array([30.0]), jnp.array([0.1])).sample(key)
+    assert action[0] == 1.0
+    assert np.isfinite(log_prob)
+
+
+def test_target_value_by_hand():
+    # Equations 23, 24, 29: 1 + 0.9 (2 - 0.5 (-3)) = 4.15; terminated: 1.
+    arguments = {"next_q": jnp.array(2.0), "next_log_prob": jnp.array(-3.0), "alpha": 0.5, "discount": 0.9}
+    assert sac.target_value(jnp.array(1.0), jnp.array(0.0), **arguments) == pytest.approx(4.15)
+    assert sac.target_value(jnp.array(1.0), jnp.array(1.0), **arguments) == pytest.approx(1.0)
+
+
+def test_critic_loss_by_hand(key):
+    """Equation 27 with constant networks: Q_1 = Q_2 = 0 against a target of r alone (γ = 0)."""
+    spec, settings = specs.get("hopper"), tiny()
+    nets = sac.make_networks(settings, spec)
+    agent = sac.init(key, nets, spec)
+    zero = jax.tree.map(jnp.zeros_like, agent.critic)
+    batch = _batch(spec, reward=jnp.array([1.0, 3.0]))
+    loss, q_mean = sac.critic_loss(zero, agent, batch, jnp.float32(0.0), key, nets=nets)
+    assert loss == pytest.approx(0.5 * (1 + 9) / 2 * 2)  # two critics
+    assert q_mean == 0
+
+
+def test_actor_loss_is_the_kl_divergence_up_to_a_constant(key):
+    """Equations 25 and 28 at α = 1: with Q = 0 everywhere the loss is E[log π]."""
+    spec, settings = specs.get("hopper"), tiny()
+    nets = sac.make_networks(settings, spec)
+    agent = sac.init(key, nets, spec)
+    zero = jax.tree.map(jnp.zeros_like, agent.critic)
+    loss, log_prob = sac.actor_loss(agent.actor, zero, jnp.float32(1.0), _batch(spec).obs, key, nets=nets)
+    assert loss == pytest.approx(float(log_prob))
+
+
+def test_temperature_moves_towards_the_target_entropy(key):
+    spec, settings = specs.get("hopper"), tiny()
+    nets = sac.make_networks(settings, spec)
+    agent = sac.init(key, nets, spec)
+    for target, rises in ((50.0, True), (-50.0, False)):
+        hyper = Hyper.of(settings).replace(target_entropy=jnp.float32(target))
+        after = sac.update(agent, _batch(spec), hyper, key, nets=nets)
+        assert (after.log_alpha > agent.log_alpha) == rises
+
+
+def test_target_critic_is_a_running_average(key):
+    spec, settings = specs.get("hopper"), tiny()
+    nets = sac.make_networks(settings, spec)
+    agent = sac.init(key, nets, spec)
+    after = sac.update(agent, _batch(spec), Hyper.of(settings), key, nets=nets)
+    expected = jax.tree.map(lambda old, new: 0.995 * old + 0.005 * new, agent.target_critic, after.critic)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), after.target_critic, expected)
+
+
+@pytest.mark.parametrize(
+    ("task", "corners"),
+    [
+        # Table 1: hopper 1 → 15 over epochs 20 → 100; by hand at 60: 1 + 40 / 80 · 14 = 8.
+        ("hopper", {0: 1, 20: 1, 25: 1, 26: 2, 60: 8, 99: 14, 100: 15, 5000: 15}),
+        ("ball_in_cup", {0: 1, 60: 1, 150: 1}),
+    ],
+)
+def test_horizon_schedule(task, corners):
+    from vecpsmbpo import config
+
+    settings = config.compose([f"env={task}"])
+    for epoch, horizon in corners.items():
+        assert imagination.horizon(settings, jnp.int32(1000 * epoch)) == horizon, epoch
+
+
+def test_horizon_schedule_may_fall():
+    settings = tiny(horizon_first=9, horizon_last=1, horizon_ramp_start=0, horizon_ramp_end=8)
+    for epoch, horizon in {0: 9, 4: 5, 8: 1, 9: 1}.items():
+        assert imagination.horizon(settings, jnp.int32(1000 * epoch)) == horizon
+
+
+def test_longer_rollouts_start_from_fewer_states_and_are_never_cut():
+    from vecpsmbpo import config
+
+    settings = config.compose(["env=hopper"])
+    chunk, capacity = imagination.chunk_size(settings), imagination.ring_capacity(settings)
+    assert capacity == 10**6
+    assert 100_000 % chunk == 0
+    for horizon in range(1, 16):
+        starts = chunk * int(imagination.chunks_per_refresh(settings, jnp.int32(horizon)))
+        assert starts == (100_000 if horizon <= 10 else capacity // (horizon * chunk) * chunk)
+        assert starts * horizon <= capacity
+
+
+def _batch(spec, reward=None) -> Transition:
+    reward = jnp.zeros(2) if reward is None else reward
+    obs = jnp.linspace(-1, 1, 2 * spec.obs_size).reshape(2, -1)
+    return Transition(obs, jnp.zeros((2, spec.action_size)), reward, obs + 0.1, jnp.zeros(2))

@@ -1,0 +1,127 @@
+"""The command line. Imports JAX only once every argument has been understood."""
+
+import sys
+from collections.abc import Sequence
+
+from vecpsmbpo.settings import SettingError
+
+HELP = """\
+vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX and MJX
+
+  vecpsmbpo train env=cartpole_swingup size=cpu     train; name=value as many as wanted
+  vecpsmbpo train run_dir=runs/x                    go on with the run in runs/x
+  vecpsmbpo train -m env=hopper real_ratio=0,0.05   one run after the other, for every value (Hydra multirun)
+  vecpsmbpo eval run_dir=runs/x episodes=10         evaluate it
+  vecpsmbpo envs                                    tasks, backends, sizes
+
+{groups}
+settings: {settings}
+
+What each setting does stands beside its default in {config}.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs a command line; the exit status. A user's mistake is one line on stderr and status 2."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(arguments)
+    except SettingError as error:
+        print(f"vecpsmbpo: {error}", file=sys.stderr)
+        return 2
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_help())
+        return 0 if arguments else 2
+    command, rest = arguments[0], arguments[1:]
+    if "-h" in rest or "--help" in rest:
+        print(_help())
+        return 0
+    if command == "envs":
+        return _envs(rest)
+    if command == "eval":
+        return _eval(rest)
+    if command == "train":
+        multirun = {"-m", "--multirun"} & set(rest)
+        overrides = [text for text in rest if text not in ("-m", "--multirun")]
+        return _multirun(overrides) if multirun else _train(overrides)
+    raise SettingError(f"{command}: no such command; one of train, eval, envs")
+
+
+def _train(overrides: list[str]) -> int:
+    from vecpsmbpo import config
+
+    return _run(config.resolve(overrides))
+
+
+def _run(settings) -> int:
+    from vecpsmbpo.train import Diverged, train
+
+    try:
+        return train(settings)
+    except Diverged as error:
+        print(f"vecpsmbpo: {error}", file=sys.stderr)
+        return 1
+
+
+def _multirun(overrides: list[str]) -> int:
+    """Hydra's own multirun, so that its sweepers and launchers work."""
+    import hydra
+
+    from vecpsmbpo import config
+
+    config.parse(overrides, sweep=True)
+
+    def task(tree) -> None:
+        from hydra.core.hydra_config import HydraConfig
+
+        status = _run(config.resolve(list(HydraConfig.get().overrides.task)))
+        if status:
+            sys.exit(status)
+
+    sys.argv = ["vecpsmbpo", "--multirun", *overrides]
+    hydra.main(version_base="1.3", config_path="pkg://vecpsmbpo.configs", config_name="config")(task)()
+    return 0
+
+
+def _eval(rest: list[str]) -> int:
+    from vecpsmbpo.evaluate import evaluate
+
+    return evaluate(rest)
+
+
+def _envs(rest: list[str]) -> int:
+    if rest:
+        raise SettingError(f"{rest[0]}: envs takes no arguments")
+    from rich.console import Console
+    from rich.table import Table
+
+    from vecpsmbpo.envs.registry import TASKS
+
+    table = Table("task", "backends", "obs", "action", "episode", "suite", "installed", box=None)
+    for name, task in TASKS.items():
+        row = (task.obs_size, task.action_size, task.episode_length)
+        table.add_row(name, ", ".join(task.backends), *map(str, row), task.suite, "yes" if task.installed else "no")
+    Console(width=120).print(table)
+    return 0
+
+
+def _help() -> str:
+    import textwrap
+    from importlib import resources
+
+    from vecpsmbpo import config
+    from vecpsmbpo.settings import FIELDS
+
+    plain = [name for name in FIELDS if name not in config.GROUPS]
+    return HELP.format(
+        groups="\n".join(f"{group + '=':10}{', '.join(config.options(group))}" for group in config.GROUPS),
+        settings=textwrap.fill(", ".join(plain), 110, subsequent_indent="          "),
+        config=resources.files("vecpsmbpo.configs") / "config.yaml",
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,169 @@
+"""From a command line to `Settings`: Hydra composes, and every mistake becomes one line."""
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import hydra
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from vecpsmbpo.envs import registry
+from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, build, check
+
+CONFIG_FILE = "config.yaml"
+GROUPS = ("env", "algo", "size")
+# What the name of a default run directory already says, or need not say.
+_UNNAMED = frozenset({*GROUPS, "seed", "run_dir", *CHANGEABLE})
+
+
+def options(group: str) -> list[str]:
+    """The names that `group=` may take."""
+    folder = resources.files("vecpsmbpo.configs") / group
+    return sorted(Path(item.name).stem for item in folder.iterdir() if item.name.endswith(".yaml"))
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """What may have been meant by `name`, for the end of an error line."""
+    known = sorted(known)
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    return f"did you mean {' or '.join(near)}?" if near else f"one of {', '.join(known)}"
+
+
+def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
+    """Checks each override on its own: its name, and what its value may be.
+
+    Args:
+        overrides: `name=value` each.
+        sweep: values may be several, as Hydra's multirun has them.
+
+    Returns:
+        Value by name.
+
+    Raises:
+        SettingError: what is wrong with the first wrong one.
+    """
+    found: dict[str, Any] = {}
+    for text in overrides:
+        if "=" not in text:
+            raise SettingError(f"{text}: must be name=value")
+        try:
+            override = OverridesParser.create().parse_override(text)
+        except HydraException as error:
+            raise SettingError(f"{text}: is not a value that can be read ({_first_line(error)})") from None
+        name = override.key_or_group
+        if sweep and name.startswith("hydra"):
+            continue
+        if override.is_sweep_override() and not sweep:
+            raise SettingError(f"{text}: several values need -m")
+        values = _sweep_values(override) if override.is_sweep_override() else [override.value()]
+        for value in values:
+            found[name] = _check_override(name, value)
+    return found
+
+
+def _sweep_values(override: Override) -> list[Any]:
+    values = list(override.sweep_iterator())
+    return [yaml.safe_load(value) if isinstance(value, str) else value for value in values]
+
+
+def _check_override(name: str, value: Any) -> Any:
+    if name in GROUPS:
+        if value not in options(name):
+            raise SettingError(f"{name}={value}: {closest(str(value), options(name))}")
+        return value
+    if name not in FIELDS:
+        raise SettingError(f"{name}: no such setting; {closest(name, FIELDS)}")
+    return check(name, "" if value is None and FIELDS[name].type is str else value)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0]
+
+
+def compose(overrides: Sequence[str]):
+    """The settings of a new run.
+
+    Raises:
+        SettingError: a mistake in `overrides`.
+    """
+    parse(overrides)
+    try:
+        with hydra.initialize_config_module("vecpsmbpo.configs", version_base="1.3"):
+            tree = hydra.compose("config", list(overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise SettingError(_first_line(error)) from None
+    return from_tree(tree, overrides)
+
+
+def from_tree(tree: DictConfig, overrides: Sequence[str]):
+    """Settings from what Hydra composed, with the backend and the run directory resolved."""
+    values: Any = OmegaConf.to_container(tree, resolve=True)
+    for group in GROUPS:
+        values[group] = values[group]["name"]
+    values["backend"] = registry.resolve_backend(values["env"], check("backend", values["backend"]))
+    settings = build(values)
+    if not settings.run_dir:
+        settings = dataclasses.replace(settings, run_dir=_default_run_dir(settings, overrides))
+    return settings
+
+
+def _default_run_dir(settings, overrides: Sequence[str]) -> str:
+    """The same command gives the same directory, so that running it again goes on with the run."""
+    parts = [settings.env, settings.algo, settings.size, f"seed{settings.seed}"]
+    extra = sorted(text for text in overrides if text.split("=")[0].lstrip("+") not in _UNNAMED)
+    parts += [text.replace("/", "_") for text in extra if not text.startswith("hydra")]
+    return str(Path("runs") / "-".join(parts))
+
+
+def save(settings, run_dir: Path) -> None:
+    """Writes `config.yaml`."""
+    text = yaml.safe_dump(dataclasses.asdict(settings), sort_keys=False)
+    (run_dir / CONFIG_FILE).write_text(text)
+
+
+def load(run_dir: str | Path):
+    """The settings that a run directory was started with.
+
+    Raises:
+        SettingError: there are none, or they cannot be read.
+    """
+    path = Path(run_dir) / CONFIG_FILE
+    try:
+        values = yaml.safe_load(path.read_text())
+        return dataclasses.replace(build(values), run_dir=str(run_dir))
+    except OSError:
+        raise SettingError(f"run_dir={run_dir}: holds no {CONFIG_FILE}, so no run") from None
+    except (KeyError, TypeError, yaml.YAMLError) as error:
+        raise SettingError(f"run_dir={run_dir}: its {CONFIG_FILE} cannot be read ({error})") from None
+
+
+def resolve(overrides: Sequence[str]):
+    """The settings of a run, new or resumed: a `run_dir` that holds one resumes with its own.
+
+    Raises:
+        SettingError: a mistake in `overrides`, or one contradicts the stored run.
+    """
+    given = parse(overrides)
+    run_dir = given.get("run_dir") or compose(overrides).run_dir
+    if not (Path(run_dir) / CONFIG_FILE).exists():
+        return compose(overrides)
+    stored = load(run_dir)
+    changed = {}
+    for name, value in given.items():
+        if name == "run_dir" or value == getattr(stored, name) or (name, value) == ("backend", "auto"):
+            continue
+        if name not in CHANGEABLE:
+            raise SettingError(
+                f"{name}={value}: contradicts the run in {run_dir}, which has {name}={getattr(stored, name)}; "
+                "leave it out to resume, or give another run_dir"
+            )
+        changed[name] = value
+    return build({**dataclasses.asdict(stored), **changed})

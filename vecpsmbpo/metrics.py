@@ -1,0 +1,143 @@
+"""What a run writes down: metrics.jsonl, episodes.jsonl and TensorBoard, each epoch and episode exactly once."""
+
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tensorboardX import SummaryWriter
+
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import EpisodeEnd, TrainState
+
+METRICS_FILE, EPISODES_FILE, TENSORBOARD = "metrics.jsonl", "episodes.jsonl", "tensorboard"
+Line = dict[str, Any]
+
+
+class RunLog:
+    """The log files of one run directory."""
+
+    def __init__(self, run_dir: Path, env_steps: int):
+        """Lines beyond `env_steps` belong to work that a kill undid and that will be done again: they are dropped."""
+        self._run_dir = run_dir
+        for name in (METRICS_FILE, EPISODES_FILE):
+            _rewind(run_dir / name, env_steps)
+        self._tensorboard = SummaryWriter(str(run_dir / TENSORBOARD), purge_step=env_steps + 1)
+
+    def episodes(self, lines: Iterable[Line]) -> None:
+        """Writes finished episodes."""
+        lines = list(lines)
+        _append(self._run_dir / EPISODES_FILE, lines)
+        for line in lines:
+            self._scalars(line, ("return", "length"), "episode")
+
+    def metrics(self, lines: Iterable[Line]) -> None:
+        """Writes an epoch."""
+        lines = list(lines)
+        _append(self._run_dir / METRICS_FILE, lines)
+        for line in lines:
+            self._scalars(line, set(line) - {"env_steps", "seed"}, "epoch")
+        self._tensorboard.flush()
+
+    def _scalars(self, line: Line, names: Iterable[str], group: str) -> None:
+        for name in names:
+            if line[name] is not None:
+                self._tensorboard.add_scalar(f"{group}/{name}/seed{line['seed']}", line[name], line["env_steps"])
+
+    def close(self) -> None:
+        self._tensorboard.close()
+
+
+def read(path: Path) -> list[Line]:
+    """The lines of a JSONL file, without one that a kill cut short; none where there is no file."""
+    lines = []
+    if path.exists():
+        for text in path.read_text().splitlines():
+            try:
+                lines.append(json.loads(text))
+            except json.JSONDecodeError:
+                break
+    return lines
+
+
+def _append(path: Path, lines: list[Line]) -> None:
+    with path.open("a") as file:
+        file.write("".join(json.dumps(line) + "\n" for line in lines))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _rewind(path: Path, env_steps: int) -> None:
+    kept = [line for line in read(path) if line["env_steps"] <= env_steps]
+    beside = path.with_suffix(".tmp")
+    beside.write_text("".join(json.dumps(line) + "\n" for line in kept))
+    beside.replace(path)
+
+
+def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[Line]:
+    """The episodes that finished in a chunk.
+
+    Args:
+        news: leaves [T, S, ...].
+        env_steps: before the chunk.
+    """
+    lines = []
+    for step, seed in zip(*np.nonzero(news.done), strict=True):
+        here = [np.asarray(leaf)[step, seed] for leaf in (news.index, news.member, news.episode_return, news.length)]
+        index, member, episode_return, length = here
+        terminated = bool(news.terminated[step, seed])
+        lines.append(
+            {
+                "seed": settings.seed + int(seed),
+                "episode": int(index),
+                "env_steps": env_steps + int(step) + 1,
+                "model": int(member) // settings.n_policies,
+                "policy": int(member) % settings.n_policies,
+                "return": float(episode_return),
+                "length": int(length),
+                "terminated": terminated,
+                "truncated": not terminated,
+                "random": bool(news.random[step, seed]),
+                "probs": news.probs[step, seed].reshape(settings.n_models, settings.n_policies).tolist(),
+            }
+        )
+    return lines
+
+
+def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
+    """What the train state says of the epoch that has just ended, one line per seed. Null: there was nothing yet."""
+    seeds = state.seeds
+    stats = {name: np.asarray(value)[:, : settings.n_members] for name, value in vars(seeds.agents.stats).items()}
+    updates = stats.pop("updates")
+    env_steps = int(state.counters.env_steps)
+    learned = updates[:, 0] > 0
+    lines = []
+    for seed in range(settings.num_seeds):
+        episodes = float(seeds.epoch_episodes[seed])
+        models = {
+            "model_loss": seeds.models.loss[seed, : settings.n_models],
+            "model_val_mse": seeds.models.val_mse[seed, : settings.n_models],
+        }
+        agents = {name: value[seed] / np.maximum(updates[seed], 1) for name, value in stats.items()}
+        lines.append(
+            {
+                "env_steps": env_steps,
+                "seed": settings.seed + seed,
+                "train_return": float(seeds.epoch_return[seed]) / episodes if episodes else None,
+                "train_episodes": int(episodes),
+                **{
+                    name: float(np.mean(value)) if learned[seed] else None
+                    for name, value in {**models, **agents}.items()
+                },
+                "real_ratio": float(seeds.hyper.real_ratio[seed]),
+                "temperature": _finite(float(seeds.hyper.temperature[seed])),
+            }
+        )
+    return lines
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity."""
+    return value if np.isfinite(value) else None

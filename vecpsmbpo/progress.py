@@ -1,0 +1,118 @@
+"""What a person sees of a run: a live line in a terminal, plain lines elsewhere."""
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from vecpsmbpo.settings import Settings
+
+
+class Display:
+    """Steps, returns, speeds and time left of one run."""
+
+    def __init__(self, settings: Settings, env_steps: int, console: Console | None = None):
+        self._settings = settings
+        self._console = console or Console(highlight=False, soft_wrap=True)
+        self._eval_return: float | None = None
+        self._train_return: float | None = None
+        self._pace = Pace(settings)
+        self._live = self._console.is_terminal
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[news]}"),
+            console=self._console,
+            disable=not self._live,
+        )
+        self._task = self._progress.add_task(
+            f"{settings.env} {settings.algo}", total=settings.total_steps, completed=env_steps, news=""
+        )
+
+    def __enter__(self) -> "Display":
+        self._progress.start()
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._progress.stop()
+
+    def say(self, text: str) -> None:
+        """One line that stays."""
+        self._console.print(text, markup=False)
+
+    def chunk(self, env_steps: int, steps: int, seconds: float, returns: list[float]) -> None:
+        """A chunk of `steps` steps ended; `returns` are of the episodes that ended in it."""
+        self._pace.chunk(env_steps, steps, seconds)
+        if returns:
+            self._train_return = sum(returns) / len(returns)
+        line = self._line(env_steps)
+        self._progress.update(self._task, completed=env_steps, news=line)
+        if not self._live and env_steps % self._settings.epoch_steps:
+            self.say(f"step {env_steps:>7} / {self._settings.total_steps}  {line}")
+
+    def epoch(self, env_steps: int, eval_return: float) -> None:
+        """An epoch ended and was evaluated; mean over seeds."""
+        self._eval_return = eval_return
+        line = self._line(env_steps)
+        self._progress.update(self._task, completed=env_steps, news=line)
+        if not self._live:
+            self.say(f"step {env_steps:>7} / {self._settings.total_steps}  {line}")
+
+    def _line(self, env_steps: int) -> str:
+        def number(value: float | None) -> str:
+            return "–" if value is None else f"{value:.4g}"
+
+        return (
+            f"return {number(self._train_return)}  eval {number(self._eval_return)}  "
+            f"{self._pace.steps_per_s:.3g} steps/s  {self._pace.updates_per_s:.3g} updates/s  "
+            f"left {self._pace.left(env_steps)}"
+        )
+
+
+class Pace:
+    """Speeds of the last chunk, and what they say of the time left."""
+
+    def __init__(self, settings: Settings):
+        self._settings = settings
+        self.steps_per_s = 0.0
+        self.updates_per_s = 0.0
+        self._learning_step_s: float | None = None  # seconds per step since learning began, smoothed
+        self._warmup_step_s = 0.0
+
+    def chunk(self, env_steps: int, steps: int, seconds: float) -> None:
+        settings = self._settings
+        self.steps_per_s = settings.num_seeds * steps / seconds
+        learned = env_steps - steps >= settings.warmup_steps
+        updates = settings.updates_per_step * settings.n_members
+        self.updates_per_s = self.steps_per_s * updates if learned else 0.0
+        pace = seconds / steps
+        if learned:
+            before = self._learning_step_s
+            self._learning_step_s = pace if before is None else 0.7 * before + 0.3 * pace
+        else:
+            self._warmup_step_s = pace
+
+    def left(self, env_steps: int) -> str:
+        """Time left; a dash before learning has begun, since warm-up steps say nothing of what follows."""
+        if self._learning_step_s is None:
+            return "–"
+        return duration((self._settings.total_steps - env_steps) * self._learning_step_s)
+
+
+def duration(seconds: float) -> str:
+    """1:02:03, or 2:03 below an hour."""
+    minutes, second = divmod(round(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02}:{second:02}" if hours else f"{minute}:{second:02}"
+
+
+class Stopwatch:
+    """Seconds since it was made, plus those of earlier sessions."""
+
+    def __init__(self, before: float = 0.0):
+        self._began = time.perf_counter() - before
+
+    def __call__(self) -> float:
+        return time.perf_counter() - self._began

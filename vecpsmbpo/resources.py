@@ -1,0 +1,77 @@
+"""The memory that a run will take, before any of it is taken, and the memory that there is."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from vecpsmbpo import imagination, replay
+from vecpsmbpo.layout import MEMBERS, SEEDS, Layout
+from vecpsmbpo.settings import SettingError, Settings
+from vecpsmbpo.types import EnvSpec
+
+GIB = 2**30
+
+
+def state_bytes(layout: Layout, shapes: Any) -> int:
+    """Bytes that a train state of these shapes takes on the whole mesh, replicas included."""
+    total = 0
+    for leaf, sharding in zip(jax.tree.leaves(shapes), jax.tree.leaves(layout.shardings(shapes)), strict=True):
+        split = {axis for part in sharding.spec if part for axis in ((part,) if isinstance(part, str) else part)}
+        replicas = np.prod([layout.mesh.shape[axis] for axis in (SEEDS, MEMBERS) if axis not in split])
+        size = 8 if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf.dtype.itemsize
+        total += int(np.prod(leaf.shape, dtype=np.int64)) * size * int(replicas)
+    return total
+
+
+def working_bytes(settings: Settings, spec: EnvSpec, layout: Layout) -> int:
+    """Bytes of the largest temporaries: minibatches of a step, rows in flight of a rollout, a copy of the agents."""
+    row = 4 * replay.row_size(spec.obs_size, spec.action_size)
+    members = layout.padded_members * settings.num_seeds
+    minibatches = 3 * settings.updates_per_step * settings.policy_batch_size * row
+    rollout = imagination.chunk_size(settings) * (2 * row + 8 * settings.model_hidden_size)
+    return members * max(minibatches, rollout)
+
+
+def available_bytes(layout: Layout) -> int:
+    """Free memory for the mesh: of the GPUs, or of this machine (and its control group)."""
+    devices = layout.mesh.devices.ravel()
+    if devices[0].platform != "cpu":
+        stats = [device.memory_stats() or {} for device in devices]
+        return sum(s.get("bytes_limit", 0) - s.get("bytes_in_use", 0) for s in stats)
+    return min(_machine_available(), _control_group_available())
+
+
+def _machine_available() -> int:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return 2**63  # not Linux: nothing to compare with
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
+
+
+def _control_group_available() -> int:
+    try:
+        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
+        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
+    except OSError:
+        return 2**63
+    return 2**63 if limit == "max" else int(limit) - used
+
+
+def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any) -> str:
+    """What the run takes against what there is, in words.
+
+    Raises:
+        SettingError: it does not fit.
+    """
+    state, working = state_bytes(layout, shapes), working_bytes(settings, spec, layout)
+    free = available_bytes(layout)
+    words = f"{state / GIB:.2f} GiB of buffers and networks, {working / GIB:.2f} GiB at work"
+    if state + working > free:
+        raise SettingError(
+            f"not enough memory: {words}, but {free / GIB:.2f} GiB are free; lower imagined_capacity, "
+            "replay_capacity, n_models, n_policies or num_seeds"
+        )
+    return f"{words}, of {free / GIB:.1f} GiB free"

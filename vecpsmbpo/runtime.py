@@ -1,0 +1,44 @@
+"""Sets JAX up for a run. Must come before the first array: a backend cannot be changed once it is there."""
+
+import logging
+import os
+from pathlib import Path
+
+import jax
+
+from vecpsmbpo.settings import Settings
+
+SINGLE_THREADED = "--xla_cpu_multi_thread_eigen=false"
+
+
+def configure(settings: Settings) -> None:
+    """One CPU device per core that can be given work, and the compilation cache.
+
+    Each CPU device then computes on one thread: members spread over devices use the cores better than threads inside
+    small matrix products do, and results do not depend on the scheduling of threads. JAX ignores the CPU settings
+    where there is a GPU.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    useful = min(settings.devices or cores, cores, settings.num_seeds * settings.n_members)
+    flags = os.environ.get("XLA_FLAGS", "")
+    if useful > 1 and "xla_cpu_multi_thread_eigen" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {SINGLE_THREADED}".strip()
+    if "xla_force_host_platform_device_count" not in flags:
+        try:
+            jax.config.update("jax_num_cpu_devices", useful)
+        except RuntimeError:  # a backend is there already: a program that imports this package set it up its own way
+            logging.getLogger(__name__).debug("JAX is already initialised; its devices are used as they are")
+    if settings.compile_cache:
+        jax.config.update("jax_compilation_cache_dir", str(cache_dir()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+        jax.config.update("jax_raise_persistent_cache_errors", False)
+    else:
+        jax.config.update("jax_enable_compilation_cache", False)
+
+
+def cache_dir() -> Path:
+    """Where compiled programs are kept: `JAX_COMPILATION_CACHE_DIR`, or below the user's cache directory."""
+    if chosen := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "vecpsmbpo" / "jax"

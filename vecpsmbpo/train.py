@@ -1,0 +1,275 @@
+"""The one loop that does input and output: chunks of the compiled program, and what is kept of them."""
+
+import dataclasses
+import errno
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vecpsmbpo import checkpoint, config, envs, metrics, resources, runtime
+from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
+from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
+from vecpsmbpo.envs import specs
+from vecpsmbpo.layout import Layout
+from vecpsmbpo.progress import Display, Stopwatch
+from vecpsmbpo.settings import SettingError, Settings
+from vecpsmbpo.types import Hyper, TrainState
+
+LONG_EPOCH_S = 20.0  # an epoch that takes longer is run period by period, to show progress and to heed signals
+
+
+class Diverged(Exception):
+    """A loss or a parameter is not finite: what, of which seed and member, and when."""
+
+
+def make_driver(settings: Settings) -> Driver:
+    """The algorithm on the task, on this process's devices. `runtime.configure` comes first."""
+    algorithm = PsMbpo(settings, specs.get(settings.env), Layout.of(settings))
+    if settings.backend == "mjx":
+        return ScanDriver(algorithm, envs.make(settings.env, "mjx"))
+
+    def make_env(**kwargs: Any):
+        return envs.make(settings.env, "host", **kwargs)
+
+    return HostDriver(algorithm, make_env)
+
+
+def initial_inputs(settings: Settings) -> tuple[jax.Array, Hyper]:
+    """A key [S] per seed, the same as if that seed ran alone; hyperparameters with leaves [S]."""
+    keys = jax.vmap(jax.random.key)(settings.seed + jnp.arange(settings.num_seeds))
+    return keys, jax.tree.map(lambda x: jnp.full(settings.num_seeds, x), Hyper.of(settings))
+
+
+def evaluation_keys(settings: Settings, env_steps: int) -> jax.Array:
+    """A key [S] per seed for the evaluation at `env_steps`; evaluating never moves the run's own keys."""
+    keys, _ = initial_inputs(settings)
+    return jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, 0xE7A1), env_steps))(keys)
+
+
+def train(settings: Settings) -> int:
+    """Runs, or goes on with, the run in `settings.run_dir`.
+
+    Returns:
+        0, or 128 + the number of the signal that stopped it.
+
+    Raises:
+        SettingError: it cannot be run as asked.
+        Diverged: something became NaN or infinite.
+    """
+    runtime.configure(settings)
+    driver = make_driver(settings)
+    shapes = jax.eval_shape(driver.init, *initial_inputs(settings))
+    memory = resources.check_memory(settings, driver.algorithm.spec, driver.layout, shapes)
+    run_dir = Path(settings.run_dir)
+    with _disk_errors(run_dir):
+        run_dir.mkdir(parents=True, exist_ok=True)
+        config.save(settings, run_dir)
+        with _heeding_signals() as stop:
+            return _Run(settings, driver, shapes, memory).go(stop)
+
+
+class _Run:
+    """One session of a run: from a checkpoint, or from nothing, to its end or a signal."""
+
+    def __init__(self, settings: Settings, driver: Driver, shapes: TrainState, memory: str):
+        self.settings, self.driver = settings, driver
+        self.run_dir = Path(settings.run_dir)
+        self.checkpoints = checkpoint.Checkpoints(self.run_dir / "checkpoints")
+        saved = self.checkpoints.restore(shapes, driver.layout, warn=lambda text: _warn(text))
+        self.state = saved.state if saved else driver.init(*initial_inputs(settings))
+        self.saved_step = saved.step if saved else None
+        self.watch = Stopwatch(saved.host["seconds"] if saved else 0.0)
+        if saved:
+            driver.load_env(saved.host["env"])
+        self.env_steps = saved.step if saved else 0
+        self.log = metrics.RunLog(self.run_dir, self.env_steps)
+        self.display = Display(settings, self.env_steps)
+        self.memory = memory
+        self.epoch_began = time.perf_counter()
+        self.epoch_steps_done = 0
+        self.epoch_estimate = float("inf")
+
+    def go(self, stop: "_Stop") -> int:
+        settings = self.settings
+        try:
+            with self.display:
+                self._introduce()
+                if self.env_steps >= settings.total_steps:
+                    self.display.say(f"already complete at {self.env_steps} steps; raise total_steps to go on")
+                    return 0
+                if self.saved_step is None:
+                    self._save()  # also shows at once, and not after hours, that there is room on the disk
+                self._compile()
+                while self.env_steps < settings.total_steps and not stop.requested:
+                    self._chunk()
+                self._save()
+                return self._farewell(stop)
+        finally:
+            self.log.close()
+            self.checkpoints.close()
+
+    def _introduce(self) -> None:
+        settings, layout = self.settings, self.driver.layout
+        self.display.say(
+            f"{settings.env} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × "
+            f"N = {settings.n_models} models × M = {settings.n_policies} policies, "
+            f"{settings.updates_per_step} updates per step, on {layout.mesh.size} {jax.default_backend()} device(s)"
+        )
+        self.display.say(f"memory: {self.memory}")
+        where = f"resuming at step {self.env_steps}" if self.env_steps else "starting"
+        self.display.say(f"run directory: {self.run_dir} ({where})")
+
+    def _compile(self) -> None:
+        self.display.say("compiling the training program; the compilation cache makes this short next time …")
+        self.driver.compile(self.state)
+        self.display.say(f"compiled in {self.driver.compile_seconds:.1f} s")
+
+    def _chunk(self) -> None:
+        """Runs to the end of the epoch, or one period of a long one, and writes down what happened."""
+        settings = self.settings
+        into_epoch = self.env_steps % settings.epoch_steps
+        if into_epoch == 0:
+            self.epoch_began, self.epoch_steps_done = time.perf_counter(), 0
+        periods = (settings.epoch_steps - into_epoch) // settings.model_update_every
+        if self.epoch_estimate > LONG_EPOCH_S:
+            periods = 1
+        began = time.perf_counter()
+        self.state, news = self.driver.run(self.state, periods)
+        seconds = time.perf_counter() - began
+        steps = periods * settings.model_update_every
+        self.epoch_estimate = seconds / steps * settings.epoch_steps
+        before, self.env_steps = self.env_steps, self.env_steps + steps
+        self.epoch_steps_done += steps
+        self._check_finite(before)
+        episodes = metrics.episode_lines(news, before, settings)
+        self.log.episodes(episodes)
+        self.display.chunk(self.env_steps, steps, seconds, [line["return"] for line in episodes])
+        if self.env_steps % settings.epoch_steps == 0:
+            self._end_epoch()
+
+    def _end_epoch(self) -> None:
+        settings = self.settings
+        seconds = time.perf_counter() - self.epoch_began
+        keys = evaluation_keys(settings, self.env_steps)
+        returns = self.driver.evaluate(self.state, keys, settings.eval_episodes)
+        self.log.metrics(self._lines(returns, seconds))
+        self.display.epoch(self.env_steps, float(np.mean(returns.episode_return)))
+        epoch = self.env_steps // settings.epoch_steps
+        if epoch % settings.checkpoint_every == 0 and self.env_steps < settings.total_steps:
+            self._save()
+
+    def _lines(self, returns: Returns, seconds: float) -> list[metrics.Line]:
+        settings = self.settings
+        steps_per_s = settings.num_seeds * self.epoch_steps_done / seconds
+        learning = self.env_steps - self.epoch_steps_done >= settings.warmup_steps
+        updates_per_s = steps_per_s * settings.updates_per_step * settings.n_members if learning else 0.0
+        return [
+            {
+                **line,
+                "eval_return": float(returns.episode_return[index].mean()),
+                "eval_length": float(returns.length[index].mean()),
+                "env_steps_per_s": steps_per_s,
+                "updates_per_s": updates_per_s,
+                "compile_seconds": self.driver.compile_seconds,
+                "seconds": self.watch(),
+            }
+            for index, line in enumerate(metrics.epoch_lines(self.state, settings))
+        ]
+
+    def _save(self) -> None:
+        if self.saved_step != self.env_steps:
+            host = {"env": self.driver.save_env(), "seconds": self.watch()}
+            self.checkpoints.save(self.env_steps, self.state, host, self.driver.layout)
+            self.saved_step = self.env_steps
+
+    def _farewell(self, stop: "_Stop") -> int:
+        self.display.say(f"saved at step {self.env_steps} of {self.settings.total_steps}: {self.run_dir}")
+        if self.env_steps < self.settings.total_steps:
+            self.display.say(f"to continue: vecpsmbpo train run_dir={self.run_dir}")
+            return 128 + (stop.requested or 0)
+        self.display.say(f"to evaluate: vecpsmbpo eval run_dir={self.run_dir} episodes=10")
+        return 0
+
+    def _check_finite(self, before: int) -> None:
+        seeds = self.state.seeds
+        for kind, tree in (("agents", seeds.agents), ("models", seeds.models)):
+            if bool(_all_finite(tree)):
+                continue
+            what, seed, index = _first_not_finite(tree, self.driver.layout, kind)
+            member = (
+                f"model n = {index}"
+                if kind == "models"
+                else f"policy n = {index // self.settings.n_policies}, m = {index % self.settings.n_policies}"
+            )
+            last = "none" if self.saved_step is None else f"step {self.saved_step}"
+            raise Diverged(
+                f"{what} of seed {self.settings.seed + seed}, {member}, stopped being finite between steps {before} "
+                f"and {self.env_steps}; last good checkpoint: {last} in {self.run_dir}"
+            )
+
+
+@jax.jit
+def _all_finite(tree: Any) -> jax.Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
+
+
+def _first_not_finite(tree: Any, layout: Layout, kind: str) -> tuple[str, int, int]:
+    """Name of the leaf, seed and member (or model) of the first entry that is not finite."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        bad = ~np.isfinite(np.asarray(leaf)).reshape(*leaf.shape[:2], -1).all(axis=-1)
+        if bad.any():
+            seed, index = np.argwhere(bad)[0]
+            return jax.tree_util.keystr(path).lstrip("."), int(seed), int(index)
+    raise AssertionError(f"{kind} are finite after all")
+
+
+@dataclasses.dataclass
+class _Stop:
+    requested: int | None = None
+
+
+@contextmanager
+def _heeding_signals() -> Iterator[_Stop]:
+    """SIGINT and SIGTERM ask the run to stop after its chunk; a second one stops it at once."""
+    stop = _Stop()
+
+    def ask(number: int, frame: Any) -> None:
+        if stop.requested is not None:
+            raise KeyboardInterrupt
+        stop.requested = number
+        print("\nfinishing this chunk and saving; once more to stop at once", file=sys.stderr, flush=True)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _disk_errors(run_dir: Path) -> Iterator[None]:
+    """Turns a disk that cannot be written into one line."""
+    try:
+        yield
+    except OSError as error:
+        raise SettingError(f"run_dir={run_dir}: cannot be written ({os.strerror(error.errno or errno.EIO)})") from error
+    except ValueError as error:  # orbax's storage layer reports a full disk so
+        if "No space left" not in str(error) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise SettingError(f"run_dir={run_dir}: cannot be written (No space left on device)") from error
+
+
+def _warn(text: str) -> None:
+    print(f"vecpsmbpo: warning: {text}", file=sys.stderr, flush=True)
+    logging.getLogger(__name__).debug(text)
