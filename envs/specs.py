@@ -34,6 +34,4 @@ _TERMINATION = {"hopper": hopper_falls}
 def get(name: str) -> EnvSpec:
     """The spec of a task in the registry."""
     task = TASKS[name]
-    return EnvSpec(
-        name, task.obs_size, task.action_size, task.episode_length, _TERMINATION.get(name, never)
-    )
+    return EnvSpec(name, task.obs_size, task.action_size, task.episode_length, _TERMINATION.get(name, never))

@@ -81,7 +81,9 @@ def test_optimistic_probabilities_by_hand():
 
 def test_infinite_temperature_is_uniform():
     earned = Posterior(jnp.array([1e6, 0.0, -1e6]), jnp.zeros(3))
-    np.testing.assert_array_equal(jax.nn.softmax(posterior.logits(earned, jnp.inf)), np.full(3, 1 / 3, np.float32))
+    np.testing.assert_array_equal(
+        jax.nn.softmax(posterior.logits(earned, jnp.inf)), np.full(3, 1 / 3, np.float32)
+    )
 
 
 def test_members_are_drawn_with_the_probabilities_of_equation_19():

@@ -87,9 +87,12 @@ def _multirun(overrides: list[str]) -> int:
 
 
 def _eval(rest: list[str]) -> int:
+    from vecpsmbpo import config
+
+    stored, settings = config.resolve_evaluation(rest)
     from vecpsmbpo.evaluate import evaluate
 
-    return evaluate(rest)
+    return evaluate(stored, settings)
 
 
 def _envs(rest: list[str]) -> int:
@@ -103,7 +106,9 @@ def _envs(rest: list[str]) -> int:
     table = Table("task", "backends", "obs", "action", "episode", "suite", "installed", box=None)
     for name, task in TASKS.items():
         row = (task.obs_size, task.action_size, task.episode_length)
-        table.add_row(name, ", ".join(task.backends), *map(str, row), task.suite, "yes" if task.installed else "no")
+        table.add_row(
+            name, ", ".join(task.backends), *map(str, row), task.suite, "yes" if task.installed else "no"
+        )
     Console(width=120).print(table)
     return 0
 

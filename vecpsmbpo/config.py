@@ -167,3 +167,32 @@ def resolve(overrides: Sequence[str]):
             )
         changed[name] = value
     return build({**dataclasses.asdict(stored), **changed})
+
+
+# What `vecpsmbpo eval` may be told, and the settings that it stands for.
+EVALUATION = {
+    "episodes": "eval_episodes",
+    "policy": "eval_policy",
+    "backend": "backend",
+    "devices": "devices",
+}
+
+
+def resolve_evaluation(overrides: Sequence[str]):
+    """Settings of the run in `run_dir=`, as stored and as they are to be evaluated.
+
+    Raises:
+        SettingError: a mistake in `overrides`.
+    """
+    given: dict[str, Any] = {}
+    for text in overrides:
+        name, equals, value = text.partition("=")
+        if not equals or name not in ("run_dir", *EVALUATION):
+            raise SettingError(f"{text}: eval takes run_dir=…, {'=…, '.join(EVALUATION)}=…")
+        given[name] = value
+    if "run_dir" not in given:
+        raise SettingError("run_dir: eval needs run_dir=…, a directory that train has written")
+    stored = load(given.pop("run_dir"))
+    changes = {EVALUATION[name]: check(EVALUATION[name], value) for name, value in given.items()}
+    changes["backend"] = registry.resolve_backend(stored.env, changes.get("backend", stored.backend))
+    return stored, dataclasses.replace(stored, **changes)

@@ -128,9 +128,7 @@ class ScanDriver:
         self.compile_seconds = 0.0
         specs = self.layout.specs()
         self._init = self.layout.spread(self._init_local, (_BY_SEED, _BY_SEED), specs)
-        self._run = self.layout.spread(
-            self._run_local, (specs, _SHARED), (specs, _LOG), donate_argnums=0
-        )
+        self._run = self.layout.spread(self._run_local, (specs, _SHARED), (specs, _LOG), donate_argnums=0)
         self._evaluate = self.layout.spread(
             self._evaluate_local, (specs.seeds, _BY_SEED), (_BY_SEED, _BY_SEED)
         )
@@ -144,7 +142,9 @@ class ScanDriver:
         began = time.perf_counter()
         keys = jax.eval_shape(lambda key: _split(key, self.settings.eval_episodes), state.seeds.key)
         lowered = (self._run.lower(state, jnp.int32(1)), self._evaluate.lower(state.seeds, keys))
-        with ThreadPoolExecutor() as pool:  # XLA compiles outside of Python's lock: together they cost the longer one
+        with (
+            ThreadPoolExecutor() as pool
+        ):  # XLA compiles outside of Python's lock: together they cost the longer one
             self._compiled, self._compiled_evaluate = pool.map(lambda program: program.compile(), lowered)
         self.compile_seconds = time.perf_counter() - began
 

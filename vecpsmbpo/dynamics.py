@@ -166,4 +166,3 @@ def fit(
     start = (model.params, model.optimizer, model.params, validate(model.params), 0, 0, model.loss)
     _, optimizer, params, best, _, _, train_loss = jax.lax.while_loop(unfinished, epoch, start)
     return model.replace(params=params, optimizer=optimizer, loss=train_loss, val_mse=best)
-

@@ -7,7 +7,9 @@ from vecpsmbpo import dynamics, replay, sac
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EnvSpec, Model, Params, Transition
 
-LARGEST_CHUNK = 4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
+LARGEST_CHUNK = (
+    4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
+)
 
 
 def chunk_size(settings: Settings) -> int:

@@ -119,7 +119,9 @@ class Layout:
         index = member - jax.lax.axis_index(MEMBERS) * local
         here = (index >= 0) & (index < local)
         index = jnp.clip(index, 0, local - 1)
-        answer = function(jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, index, keepdims=False), tree))
+        answer = function(
+            jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, index, keepdims=False), tree)
+        )
         masked = jax.tree.map(lambda x: jnp.where(here, x, jnp.zeros_like(x)), answer)
         return jax.lax.psum(masked, MEMBERS)
 
@@ -149,7 +151,9 @@ class Layout:
             function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
         )
         # Shardings are stated, not inferred, so that a fresh and a resumed run are one program to the cache.
-        return jax.jit(body, in_shardings=self._placed(in_specs), out_shardings=self._placed(out_specs), **jit)
+        return jax.jit(
+            body, in_shardings=self._placed(in_specs), out_shardings=self._placed(out_specs), **jit
+        )
 
     def _placed(self, specs: Any) -> Any:
         return jax.tree.map(

@@ -106,7 +106,12 @@ def update(agent: Agent, batch: Transition, hyper: Hyper, key: jax.Array, *, net
         lambda average, new: average + hyper.target_update_rate * (new - average), agent.target_critic, critic
     )
     news = AgentStats(
-        updates=jnp.ones(()), critic_loss=loss_q, actor_loss=loss_pi, alpha=alpha, q_mean=q_mean, entropy=-log_prob
+        updates=jnp.ones(()),
+        critic_loss=loss_q,
+        actor_loss=loss_pi,
+        alpha=alpha,
+        q_mean=q_mean,
+        entropy=-log_prob,
     )
     return Agent(
         actor=actor,
@@ -129,4 +134,3 @@ def updates(agent: Agent, batches: Transition, hyper: Hyper, key: jax.Array, *, 
 
     count = batches.reward.shape[0]
     return jax.lax.scan(body, agent, (batches, jax.random.split(key, count)))[0]
-

@@ -102,7 +102,9 @@ class Settings:
 FIELDS = {field.name: field for field in dataclasses.fields(Settings)}
 
 # Settings that a resumed run may change: they steer the loop around the run, not what it computes.
-CHANGEABLE = frozenset({"total_steps", "eval_episodes", "eval_policy", "checkpoint_every", "devices", "compile_cache"})
+CHANGEABLE = frozenset(
+    {"total_steps", "eval_episodes", "eval_policy", "checkpoint_every", "devices", "compile_cache"}
+)
 
 
 def allowed(name: str) -> str:
@@ -114,7 +116,11 @@ def allowed(name: str) -> str:
     low, high = field.metadata.get("range", (None, None))
     above = "above" if field.metadata.get("open_low") else "at least"
     if low is not None and high is not None:
-        return f"{kind} from {low} to {high}" if above == "at least" else f"{kind} above {low} and at most {high}"
+        return (
+            f"{kind} from {low} to {high}"
+            if above == "at least"
+            else f"{kind} above {low} and at most {high}"
+        )
     return kind if low is None else f"{kind}, {above} {low}"
 
 

@@ -14,9 +14,7 @@ class DmControlSimulator(Simulator):
     """One task of the suite, observations flattened in the suite's order."""
 
     def __init__(self, domain: str, task: str, seed: int):
-        self.env: Any = suite.load(
-            domain, task, task_kwargs={"random": seed, "time_limit": float("inf")}
-        )
+        self.env: Any = suite.load(domain, task, task_kwargs={"random": seed, "time_limit": float("inf")})
         action = self.env.action_spec()
         self._low, self._high = action.minimum, action.maximum
         physics = self.env.physics

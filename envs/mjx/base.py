@@ -120,4 +120,3 @@ class MjxEnv(Env):
     @property
     def backend(self) -> str:
         return "mjx"
-

@@ -98,7 +98,12 @@ class PsMbpo:
     # ── observe ──────────────────────────────────────────────────────────────────────────────────────────────
 
     def observe(
-        self, counters: Counters, state: SeedState, transition: Transition, truncated: jax.Array, key: jax.Array
+        self,
+        counters: Counters,
+        state: SeedState,
+        transition: Transition,
+        truncated: jax.Array,
+        key: jax.Array,
     ) -> tuple[SeedState, EpisodeEnd]:
         """Stores a real transition; where it ends the episode, credits the member and draws the next one."""
         episode = state.episode
@@ -177,9 +182,7 @@ class PsMbpo:
         keys = self.layout.keys(fit_key, self.layout.model_ids())
         return state.replace(models=self.layout.map_local(fit, state.models, keys))
 
-    def imagine(
-        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
-    ) -> SeedState:
+    def imagine(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Rolls every member (n, m) out in model n from real states (lines 9 and 10), into its own ring.
 
         Adds `imagined_rows` rows to every ring: a row whose rollout terminates goes on from a fresh real state, so
@@ -249,9 +252,7 @@ class PsMbpo:
         shape = (self.settings.updates_per_step, self.settings.policy_batch_size)
         source_key, real_key, imagined_key = jax.random.split(key, 3)
         real_index = replay.sample_indices(real_key, shape, counters.env_steps, state.real.shape[0])
-        imagined_index = replay.sample_indices(
-            imagined_key, shape, counters.imagined_rows, imagined.shape[0]
-        )
+        imagined_index = replay.sample_indices(imagined_key, shape, counters.imagined_rows, imagined.shape[0])
         from_real = jax.random.uniform(source_key, shape) < state.hyper.real_ratio
         rows = jnp.where(from_real[..., None], state.real[real_index], imagined[imagined_index])
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)

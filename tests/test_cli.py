@@ -1,0 +1,178 @@
+"""The command line: mistakes are one line and exit status 2, create nothing, and never import JAX."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from tests.helpers import command, environment
+from vecpsmbpo import config
+from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, allowed, check
+
+MISTAKES = [
+    (["train", "env=hoper"], "env=hoper: did you mean hopper"),
+    (["train", "size=big"], "size=big: one of cpu, paper, tiny"),
+    (["train", "algo=ops"], "algo=ops: did you mean ops_mbpo"),
+    (["train", "n_modles=3"], "n_modles: no such setting; did you mean n_models"),
+    (["train", "n_models=three"], "n_models=three: must be a whole number, at least 1"),
+    (["train", "n_models=2.5"], "n_models=2.5: must be a whole number, at least 1"),
+    (["train", "n_models=0"], "n_models=0: must be a whole number, at least 1"),
+    (["train", "real_ratio=1.5"], "real_ratio=1.5: must be a number from 0 to 1"),
+    (["train", "temperature=0"], "temperature=0: must be a number, above 0"),
+    (["train", "discount=.nan"], "discount=.nan: must be a number from 0 to 1"),
+    (["train", "backend=gpu"], "backend=gpu: must be one of auto, mjx, host"),
+    (["train", "compile_cache=maybe"], "compile_cache=maybe: must be true or false"),
+    (["train", "total_steps=1500"], "total_steps=1500: must be a multiple of epoch_steps=1000"),
+    (["train", "model_update_every=300"], "model_update_every=300: must divide epoch_steps=1000"),
+    (["train", "n_models=1,2"], "n_models=1,2: several values need -m"),
+    (["train", "hopper"], "hopper: must be name=value"),
+    (["train", "-m", "n_models=1,0"], "n_models=0: must be a whole number, at least 1"),
+    (["eval"], "run_dir: eval needs run_dir="),
+    (["eval", "run_dir=nowhere"], "run_dir=nowhere: holds no config.yaml"),
+    (["eval", "run_dir=nowhere", "n_models=2"], "n_models=2: eval takes run_dir="),
+    (["envs", "x"], "x: envs takes no arguments"),
+    (["trian"], "trian: no such command"),
+]
+
+WITHOUT_JAX = """
+import sys
+from vecpsmbpo import cli
+status = cli.main(sys.argv[1:])
+heavy = {"jax", "mujoco", "brax", "dm_control", "gymnasium", "orbax"} & set(sys.modules)
+assert not heavy, heavy
+sys.exit(status)
+"""
+
+
+@pytest.mark.parametrize(("arguments", "line"), MISTAKES, ids=lambda value: " ".join(value)[:40])
+def test_a_mistake_is_one_line_and_status_2(arguments, line, tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-c", WITHOUT_JAX, *arguments],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert result.returncode == 2, result.stderr
+    assert result.stdout == ""
+    assert result.stderr.startswith(f"vecpsmbpo: {line}")
+    assert result.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["envs"]], ids=" ".join)
+def test_help_and_envs_answer_without_jax(arguments, tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-c", WITHOUT_JAX, *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "hopper" in result.stdout
+
+
+def test_too_little_memory_is_said_before_anything_is_allocated(tmp_path):
+    result = command("train", "env=hopper", "n_models=1000", "imagined_capacity=100000000", cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.splitlines()[-1].startswith("vecpsmbpo: not enough memory: ")
+    assert "lower imagined_capacity" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_directory_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    result = command("train", "size=tiny", "run_dir=file/run", cwd=tmp_path)
+    assert result.returncode == 2
+    assert (
+        result.stderr.splitlines()[-1] == "vecpsmbpo: run_dir=file/run: cannot be written (Not a directory)"
+    )
+
+
+def test_every_setting_has_a_default_and_says_what_it_may_be():
+    settings = config.compose([])
+    for name in FIELDS:
+        assert allowed(name)
+        assert check(name, getattr(settings, name)) == getattr(settings, name)
+    assert set(FIELDS) >= CHANGEABLE
+
+
+@pytest.mark.parametrize("env", config.options("env"))
+@pytest.mark.parametrize("size", config.options("size"))
+def test_every_task_composes_at_every_size(env, size):
+    settings = config.compose([f"env={env}", f"size={size}"])
+    assert (settings.env, settings.size) == (env, size)
+
+
+def test_table_1():
+    """The paper's columns, read from the paper."""
+    hopper = config.compose(["env=hopper"])
+    assert (hopper.target_entropy, hopper.real_ratio, hopper.temperature) == (-1, 0.05, 15_000)
+    assert (hopper.horizon_first, hopper.horizon_last) == (1, 15)
+    assert (hopper.horizon_ramp_start, hopper.horizon_ramp_end) == (20, 100)
+    ball = config.compose(["env=ball_in_cup"])
+    assert (ball.target_entropy, ball.real_ratio, ball.temperature) == (-0.05, 0.5, 1000)
+    assert ball.model_weight_decay == 5e-5
+    cart = config.compose(["env=cartpole_swingup_sparse"])
+    assert (cart.target_entropy, cart.real_ratio, cart.temperature) == (-0.05, 0.5, 5000)
+    for settings in (hopper, ball, cart):
+        assert settings.episode_length == 1000
+        assert settings.total_steps in (125_000, 150_000, 400_000)
+        assert (settings.n_models, settings.n_policies) == (5, 5)
+        assert (settings.model_hidden_size, settings.model_hidden_layers) == (200, 4)
+        assert (settings.replay_capacity, settings.imagined_capacity) == (10**6, 10**6)
+        assert settings.rollout_starts == 100_000
+        assert (settings.model_batch_size, settings.policy_batch_size) == (256, 256)
+        assert (settings.discount, settings.policy_learning_rate) == (0.99, 3e-4)
+
+
+def test_uniform_sampling_is_an_infinite_temperature():
+    assert config.compose(["algo=ps_mbpo", "env=hopper"]).temperature == float("inf")
+
+
+def test_the_command_line_wins():
+    settings = config.compose(["env=hopper", "size=cpu", "n_models=4", "real_ratio=0.3"])
+    assert (settings.n_models, settings.real_ratio) == (4, 0.3)
+
+
+def test_the_default_run_directory_tells_runs_apart():
+    names = {
+        config.compose(chosen).run_dir for chosen in ([], ["seed=1"], ["real_ratio=0.5"], ["real_ratio=0"])
+    }
+    assert len(names) == 4
+    assert config.compose(["total_steps=9000"]).run_dir == config.compose([]).run_dir
+
+
+def test_saved_settings_are_loaded_as_they_were(tmp_path):
+    settings = config.compose(["algo=ps_mbpo", f"run_dir={tmp_path}"])
+    config.save(settings, tmp_path)
+    assert config.load(tmp_path) == settings
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("n_models=3", "n_models=3: contradicts the run in"),
+        ("env=hopper", "env=hopper: contradicts the run in"),
+        ("real_ratio=0.25", "real_ratio=0.25: contradicts the run in"),
+    ],
+)
+def test_a_resumed_run_keeps_its_settings(tmp_path, override, line):
+    config.save(config.compose(["size=tiny", f"run_dir={tmp_path}"]), tmp_path)
+    with pytest.raises(SettingError, match=line):
+        config.resolve([f"run_dir={tmp_path}", override])
+
+
+def test_a_resumed_run_may_be_prolonged(tmp_path):
+    config.save(config.compose(["size=tiny", f"run_dir={tmp_path}"]), tmp_path)
+    again = config.resolve([f"run_dir={tmp_path}", "total_steps=400", "n_models=2", "backend=auto"])
+    assert again.total_steps == 400
+
+
+def test_a_damaged_config_is_named(tmp_path):
+    (tmp_path / "config.yaml").write_text(json.dumps({"env": "hopper"}))
+    with pytest.raises(SettingError, match=r"its config\.yaml cannot be read"):
+        config.load(tmp_path)

@@ -1,0 +1,212 @@
+"""Both drivers on an environment whose value function is known in closed form (`probes`)."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests import probes
+from tests.helpers import algorithm, tiny
+from vecpsmbpo import metrics, replay, sac
+from vecpsmbpo.drivers import HostDriver, ScanDriver
+from vecpsmbpo.train import evaluation_keys, initial_inputs
+
+DISCOUNT = 0.5
+STEPS = 600
+
+
+def settings_for(**changes):
+    """Small but able to learn; the entropy bonus vanishes, since the target is always exceeded and α falls."""
+    chosen = {
+        "total_steps": STEPS,
+        "epoch_steps": STEPS,
+        "episode_length": probes.EPISODE_LENGTH,
+        "warmup_steps": 120,
+        "replay_capacity": 1000,
+        "model_hidden_size": 32,
+        "model_batch_size": 32,
+        "model_max_epochs": 40,
+        "rollout_starts": 100,
+        "model_update_every": 40,
+        "policy_hidden_size": 16,
+        "policy_batch_size": 32,
+        "policy_learning_rate": 3e-3,
+        "target_update_rate": 0.05,
+        "updates_per_step": 10,
+        "discount": DISCOUNT,
+        "target_entropy": -20.0,
+    }
+    return tiny(**{**chosen, **changes})
+
+
+def make_driver(kind, terminates, settings):
+    learner = algorithm(settings, probes.spec(terminates))
+    if kind == "scan":
+        return ScanDriver(learner, probes.Probe(terminates))
+    return HostDriver(learner, partial(probes.host, terminates))
+
+
+@pytest.fixture(
+    scope="module", params=[("scan", False), ("scan", True), ("host", False), ("host", True)], ids=str
+)
+def trained(request):
+    kind, terminates = request.param
+    settings = settings_for()
+    driver = make_driver(kind, terminates, settings)
+    state, news = driver.run(driver.init(*initial_inputs(settings)), settings.refreshes_per_epoch)
+    return settings, driver, terminates, state, news
+
+
+def test_q_is_the_known_value_function(trained):
+    """Q(s, π(s)) = V(s) for every member; at actions that no policy takes, Q is extrapolation."""
+    settings, driver, terminates, state, _ = trained
+    first = 1.0 if terminates else 1 / (1 - DISCOUNT**2)
+    for member in range(settings.n_members):
+        assert _value(driver, state, member, 1.0) == pytest.approx(first, abs=0.2)
+        assert _value(driver, state, member, 0.0) == pytest.approx(DISCOUNT * first, abs=0.2)
+
+
+def _value(driver, state, member, obs):
+    """min(Q_1, Q_2) of one member of the first seed at its own mean action."""
+    nets = sac.make_networks(driver.settings, driver.algorithm.spec)
+    agent = jax.tree.map(lambda x: x[0, member], state.seeds.agents)
+    obs = jnp.array([obs])
+    return float(
+        jnp.minimum(*nets.critic.apply(agent.critic, obs, nets.actor.apply(agent.actor, obs).mode()))
+    )
+
+
+def test_policies_are_optimal(trained):
+    settings, driver, _, state, _ = trained
+    nets = sac.make_networks(settings, driver.algorithm.spec)
+    actors = jax.tree.map(lambda x: x[0], state.seeds.agents.actor)
+    actions = jax.vmap(lambda actor: nets.actor.apply(actor, jnp.ones(1)).mode())(actors)
+    assert np.abs(actions[: settings.n_members]).max() < 0.35  # reward 1 - a²: at least 0.88 of the best
+
+
+def test_stored_transitions_are_the_true_ones(trained):
+    """Also at episode ends: the successor is 1 - obs and never the state after the reset."""
+    _, _, terminates, state, _ = trained
+    rows = replay.unpack(state.seeds.real[0, :STEPS], 1, 1)
+    np.testing.assert_array_equal(rows.next_obs, 1 - rows.obs)
+    np.testing.assert_array_equal(rows.terminated, (rows.obs[:, 0] > 0.5) & terminates)
+    np.testing.assert_allclose(rows.reward, rows.obs[:, 0] * (1 - rows.action[:, 0] ** 2), atol=1e-6)
+    assert np.abs(rows.action).max() <= 1
+
+
+def test_episodes_are_accounted_for(trained):
+    settings, _, terminates, state, news = trained
+    lines = metrics.episode_lines(news, 0, settings)
+    length = 2 if terminates else probes.EPISODE_LENGTH
+    assert [line["episode"] for line in lines] == list(range(1, STEPS // length + 1))
+    assert all(line["length"] == length and line["env_steps"] == length * line["episode"] for line in lines)
+    assert all(line["terminated"] == terminates for line in lines)
+    # Random while the warm-up lasts: an episode that began before its end stays random to its own end.
+    assert all(line["random"] == (line["env_steps"] - length < settings.warmup_steps) for line in lines)
+    rows = replay.unpack(state.seeds.real[0, :STEPS], 1, 1)
+    for line in lines[::7]:
+        inside = slice(line["env_steps"] - length, line["env_steps"])
+        assert line["return"] == pytest.approx(float(rows.reward[inside].sum()), rel=1e-5)
+
+
+def test_the_log_alone_gives_the_probabilities_of_equation_19(trained):
+    settings, _, _, _, news = trained
+    earned = np.zeros((settings.n_models, settings.n_policies))
+    for line in metrics.episode_lines(news, 0, settings):
+        logits = (earned - earned.max()) / settings.temperature
+        np.testing.assert_allclose(line["probs"], np.exp(logits) / np.exp(logits).sum(), atol=1e-5)
+        if not line["random"]:
+            earned[line["model"], line["policy"]] += line["return"]
+    assert earned.sum() > 0
+
+
+def test_evaluation_plays_whole_episodes_of_the_mean_action(trained):
+    settings, driver, terminates, state, _ = trained
+    returns = driver.evaluate(state, evaluation_keys(settings, STEPS), 3)
+    assert returns.episode_return.shape == (1, 3)
+    assert (returns.length == (2 if terminates else probes.EPISODE_LENGTH)).all()
+    assert (returns.episode_return > 0.85).all()
+
+
+def test_inputs_are_whitened_by_all_the_data(trained):
+    _, _, _, state, _ = trained
+    inputs = np.asarray(state.seeds.real[0, :STEPS, :2])
+    moments = jax.tree.map(lambda x: x[0], state.seeds.moments)
+    np.testing.assert_allclose(moments.mean, inputs.mean(0), atol=1e-5)
+    np.testing.assert_allclose(moments.deviation / STEPS, inputs.var(0), atol=1e-4)
+
+
+def test_an_epoch_compiles_once_whatever_the_data_size():
+    settings = settings_for(updates_per_step=1)
+    driver = make_driver("scan", False, settings)
+    state = driver.init(*initial_inputs(settings))
+    for periods in (1, 2, 1, 3, 3):
+        state, _ = driver.run(state, periods)
+    assert driver._run._cache_size() == 1
+
+
+def test_chunks_of_any_length_give_the_same_run():
+    settings = settings_for(updates_per_step=1)
+    driver = make_driver("scan", True, settings)
+    ends = []
+    for chunks in ([10], [1, 4, 2, 3]):
+        state = driver.init(*initial_inputs(settings))
+        for periods in chunks:
+            state, _ = driver.run(state, periods)
+        ends.append(state.seeds.agents.actor)
+    jax.tree.map(np.testing.assert_array_equal, *ends)
+
+
+def test_only_real_data_needs_no_models():
+    """λ = 1 (equation 15): models stay as they were, policies learn; λ = 0 (equation 14) learns from models alone."""
+    driver = make_driver("scan", True, settings_for())
+    keys, hyper = initial_inputs(driver.settings)
+    for ratio, fitted in ((1.0, False), (0.0, True)):
+        start = driver.init(keys, hyper.replace(real_ratio=jnp.full(1, ratio)))
+        before = jax.tree.map(np.asarray, start.seeds.models.params)
+        state, _ = driver.run(start, driver.settings.refreshes_per_epoch)
+        after = state.seeds.models.params
+        same = all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (before, after)), strict=True))
+        assert same != fitted
+        assert (int(state.counters.imagined_rows) > 0) == fitted
+        assert _value(driver, state, 0, 1.0) == pytest.approx(1.0, abs=0.2)
+
+
+def test_seeds_differ_and_are_what_they_are_alone():
+    settings = settings_for(updates_per_step=1, num_seeds=2)
+    driver = make_driver("scan", True, settings)
+    state, news = driver.run(driver.init(*initial_inputs(settings)), 5)
+    actions = np.asarray(state.seeds.real[:, :200, 1])
+    assert (actions[0] != actions[1]).mean() > 0.9
+    alone = dataclasses.replace(settings, num_seeds=1, seed=settings.seed + 1)
+    single = make_driver("scan", True, alone)
+    state, _ = single.run(single.init(*initial_inputs(alone)), 5)
+    # Until learning begins nothing can differ; afterwards rounding does, since the mesh is another.
+    np.testing.assert_array_equal(actions[1, :120], state.seeds.real[0, :120, 1])
+    np.testing.assert_allclose(actions[1], state.seeds.real[0, :200, 1], atol=0.05)
+    seeds = {line["seed"] for line in metrics.episode_lines(news, 0, settings)}
+    assert seeds == {0, 1}
+
+
+@pytest.mark.parametrize("policy", ["best", "average"])
+def test_other_evaluation_policies(policy):
+    settings = settings_for(eval_policy=policy)
+    driver = make_driver("scan", True, settings)
+    state = driver.init(*initial_inputs(settings))
+    nets = sac.make_networks(settings, driver.algorithm.spec)
+    # Policy i always acts tanh(i / 4); the second has earned the most.
+    actor = jax.tree.map(jnp.zeros_like, state.seeds.agents.actor)
+    bias = jnp.stack([jnp.array([i / 4, -1e3]) for i in range(4)])[None]
+    actor["params"]["ReluMLP_0"]["Dense_2"]["bias"] = bias
+    posterior = state.seeds.posterior.replace(returns=jnp.array([[0.0, 9e9, 0, 0]]))
+    seeds = state.seeds.replace(agents=state.seeds.agents.replace(actor=actor), posterior=posterior)
+    returns = driver.evaluate(
+        driver.layout.place(state.replace(seeds=seeds)), evaluation_keys(settings, 0), 1
+    )
+    actions = np.tanh(np.arange(4) / 4)
+    action = actions[1] if policy == "best" else actions.mean()
+    assert nets.actor.action_size == 1
+    assert float(returns.episode_return[0, 0]) == pytest.approx(1 - action**2, abs=1e-4)

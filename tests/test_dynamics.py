@@ -1,0 +1,120 @@
+"""The fit of one model: the split, early stopping, and that it learns."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.helpers import tiny
+from vecpsmbpo import dynamics, replay
+from vecpsmbpo.types import EnvSpec, Hyper, Moments, Transition
+
+SPEC = EnvSpec(
+    "linear", obs_size=2, action_size=1, episode_length=10, terminated=lambda o, a, n: n[..., 0] > 9
+)
+CAPACITY = 2048
+
+
+@pytest.fixture(scope="module")
+def linear():
+    """Rows of Δs = (0.5 a, -0.2 s_0) with noise 0.1, r = s_1: and the settings to fit them."""
+    settings = tiny(
+        model_hidden_size=32,
+        model_batch_size=64,
+        model_max_epochs=100,
+        model_learning_rate=3e-3,
+        model_patience=30,
+    )
+    keys = jax.random.split(jax.random.key(0), 3)
+    obs, action = jax.random.normal(keys[0], (CAPACITY, 2)), jax.random.normal(keys[1], (CAPACITY, 1))
+    delta = jnp.stack([0.5 * action[:, 0], -0.2 * obs[:, 0]], axis=1)
+    next_obs = obs + delta + 0.1 * jax.random.normal(keys[2], (CAPACITY, 2))
+    rows = replay.pack(Transition(obs, action, obs[:, 1], next_obs, jnp.zeros(CAPACITY)))
+    return settings, rows
+
+
+@pytest.fixture(scope="module")
+def fit(linear):
+    """The fit as one compiled function of (model, number of rows, max_epochs, patience is static)."""
+    settings, rows = linear
+
+    @jax.jit
+    def run(model, count, max_epochs, key):
+        split = dynamics.Split.draw(key, count, CAPACITY, settings.validation_block)
+        inputs = rows[:, :3]
+        moments = Moments(inputs.mean(0), ((inputs - inputs.mean(0)) ** 2).sum(0))
+        whitening = dynamics.scaling(moments, jnp.int32(CAPACITY))
+        hyper = Hyper.of(settings)
+        return dynamics.fit(
+            model, rows, split, whitening, hyper, key, max_epochs, settings=settings, spec=SPEC
+        )
+
+    return run
+
+
+def test_fit_learns_the_mean_and_the_noise(linear, fit, key):
+    settings, rows = linear
+    model = dynamics.init(key, settings, SPEC)
+    fitted = fit(model, jnp.int32(CAPACITY), jnp.int32(200), key)
+    obs, action = jnp.array([[0.5, -0.5]]), jnp.array([[1.0]])
+    mean, log_variance = dynamics.forward(fitted, obs, action, net=dynamics.network(settings, SPEC))
+    np.testing.assert_allclose(mean[0], [0.5, -0.1, -0.5], atol=0.05)
+    np.testing.assert_allclose(np.exp(log_variance[0, :2] / 2), 0.1, rtol=0.3)
+    # The best that any model can do is the noise's variance on two of three outputs: 0.01 · 2 / 3.
+    assert fitted.val_mse == pytest.approx(0.01 * 2 / 3, rel=0.2)
+
+
+def test_a_data_set_that_grows_needs_no_new_program(linear, fit, key):
+    settings, _ = linear
+    model = dynamics.init(key, settings, SPEC)
+    for rows in (5, 64, 777, CAPACITY):
+        model = fit(model, jnp.int32(rows), jnp.int32(2), key)
+    assert fit._cache_size() == 1
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model))
+
+
+def test_no_epochs_change_nothing_but_the_whitening(linear, fit, key):
+    settings, _ = linear
+    model = dynamics.init(key, settings, SPEC)
+    same = fit(model, jnp.int32(500), jnp.int32(0), key)
+    jax.tree.map(np.testing.assert_array_equal, same.params, model.params)
+    jax.tree.map(np.testing.assert_array_equal, same.optimizer, model.optimizer)
+
+
+def test_the_best_parameters_are_restored(linear, fit, key):
+    """Under a learning rate that destroys the model, the fit must hand back what it started from."""
+    settings, rows = linear
+    model = fit(dynamics.init(key, settings, SPEC), jnp.int32(CAPACITY), jnp.int32(200), key)
+    split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
+    hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(1.0))
+    whitening = (model.input_mean, model.input_std)
+    after = dynamics.fit(
+        model, rows, split, whitening, hyper, key, jnp.int32(20), settings=settings, spec=SPEC
+    )
+    jax.tree.map(np.testing.assert_array_equal, after.params, model.params)
+    steps = jax.tree.leaves(after.optimizer)[0] - jax.tree.leaves(model.optimizer)[0]
+    per_epoch = -(-CAPACITY // 5 * 4 // settings.model_batch_size)
+    assert steps == pytest.approx(settings.model_patience * per_epoch, abs=settings.model_patience)
+
+
+def test_split_is_a_partition_with_one_row_in_five_validating(key):
+    rows, block = 1003, 5
+    split = dynamics.Split.draw(key, jnp.int32(rows), CAPACITY, block)
+    validation, exists = split.validation_rows(jnp.int32(0), 512, block)
+    validation = np.asarray(validation)[np.asarray(exists)]
+    train = np.unique(split.train_rows(key, 40_000, block))
+    assert len(validation) == len(np.unique(validation)) == 200
+    assert not set(validation) & set(train.tolist())
+    assert set(validation) | set(train.tolist()) == set(range(1000))
+    again, _ = dynamics.Split.draw(jax.random.key(1), jnp.int32(rows), CAPACITY, block).validation_rows(
+        0, 200, block
+    )
+    assert set(validation) != set(np.asarray(again).tolist())
+
+
+def test_training_rows_are_uniform(key):
+    import scipy.stats
+
+    split = dynamics.Split.draw(key, jnp.int32(50), CAPACITY, 5)
+    counts = np.bincount(split.train_rows(key, 40_000, 5), minlength=50)
+    assert scipy.stats.chisquare(counts[counts > 0]).pvalue > 1e-3

@@ -1,0 +1,149 @@
+"""The tasks against their originals: Gymnasium and dm_control."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from vecpsmbpo import envs
+from vecpsmbpo.envs import specs
+from vecpsmbpo.envs.registry import TASKS
+from vecpsmbpo.settings import SettingError
+
+PORTED = [name for name, task in TASKS.items() if task.mjx]
+HOSTED = [name for name, task in TASKS.items() if task.host]
+
+
+def simulator_data(host, index=0):
+    env = host._simulators[index].env
+    return env.physics.data if hasattr(env, "physics") else env.unwrapped.data
+
+
+@pytest.fixture(scope="module", params=PORTED)
+def pair(request):
+    """The MJX port with its compiled functions, and the original."""
+    env = envs.make(request.param, "mjx")
+    step = jax.jit(lambda qpos, qvel, action: env.step(env.state_at(qpos, qvel), action))
+    return env, step, envs.make(request.param, "host", seed=3)
+
+
+def test_one_control_step_is_that_of_the_original(pair):
+    """From the same simulator state, over random actions: observation, reward and termination."""
+    env, step, host = pair
+    random = np.random.default_rng(0)
+    host.reset()
+    terminations = 0
+    for _ in range(150):
+        data = simulator_data(host)
+        action = random.uniform(-1, 1, (1, env.action_size))
+        state = step(np.array(data.qpos), np.array(data.qvel), action[0])
+        original = host.step(action)
+        np.testing.assert_allclose(state.obs, original.next_obs[0], atol=2e-4, rtol=1e-4)
+        assert float(state.reward) == pytest.approx(float(original.reward[0]), abs=1e-3)
+        assert bool(state.done) == bool(original.terminated[0])
+        terminations += int(original.terminated[0])
+    assert (terminations > 0) == (env.spec.name == "hopper")
+
+
+def test_sizes_are_those_of_the_registry(pair):
+    env, _, host = pair
+    task = TASKS[env.spec.name]
+    state = env.reset(jax.random.key(0))
+    assert state.obs.shape == (task.obs_size,) == host.reset().shape[1:]
+    assert env.action_size == task.action_size
+    assert env.spec.episode_length == host.episode_length == task.episode_length
+
+
+def test_resets_are_distributed_as_the_original_s(pair):
+    env, _, host = pair
+    ours = np.asarray(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 300)).obs)
+    theirs = np.concatenate([host.reset() for _ in range(300)])
+    for column in range(env.spec.obs_size):
+        if np.ptp(theirs[:, column]) == 0:
+            np.testing.assert_array_equal(ours[:, column], theirs[:, column])
+        else:
+            assert scipy.stats.ks_2samp(ours[:, column], theirs[:, column]).pvalue > 1e-4, column
+
+
+def test_ball_in_cup_rewards_the_ball_in_the_cup():
+    """The reward at states placed by hand, against dm_control's own."""
+    env = envs.make("ball_in_cup", "mjx")
+    physics = envs.make("ball_in_cup", "host")._simulators[0].env.physics
+    inside = 0
+    for x, z in np.random.default_rng(1).uniform([-0.06, 0.2], [0.06, 0.5], (200, 2)):
+        with physics.reset_context():
+            physics.data.qpos[:] = [0, 0, x, z]
+        ours = env.reward(None, None, env.state_at(jnp.array([0, 0, x, z]), jnp.zeros(4)).pipeline_state)
+        assert float(ours) == physics.in_target()
+        inside += physics.in_target()
+    assert 20 < inside < 180
+
+
+def test_sparse_cartpole_rewards_balance():
+    env = envs.make("cartpole_swingup_sparse", "mjx")
+    physics = envs.make("cartpole_swingup_sparse", "host")._simulators[0].env.physics
+    task = envs.make("cartpole_swingup_sparse", "host")._simulators[0].env.task
+    for qpos in ([0.0, 0.0], [0.0, 0.09], [0.0, 0.11], [0.24, 0.0], [0.26, 0.0], [0.0, np.pi]):
+        with physics.reset_context():
+            physics.data.qpos[:] = qpos
+        ours = env.reward(None, None, env.state_at(jnp.array(qpos), jnp.zeros(2)).pipeline_state)
+        assert float(ours) == task.get_reward(physics)
+
+
+@pytest.mark.parametrize(
+    ("z", "angle", "joint", "ends"),
+    [
+        (1.2, 0.0, 0.0, False),
+        (0.69, 0.0, 0.0, True),
+        (1.2, 0.21, 0.0, True),
+        (1.2, -0.21, 0.0, True),
+        (1.2, 0.0, 101.0, True),
+        (1.2, 0.0, np.nan, True),
+        (np.nan, 0.0, 0.0, True),
+        (np.inf, 0.0, 0.0, True),
+    ],
+)
+def test_hopper_s_termination_rule(z, angle, joint, ends):
+    obs = jnp.zeros(11).at[:3].set(jnp.array([z, angle, joint]))
+    assert bool(specs.get("hopper").terminated(obs, None, obs)) == ends
+
+
+@pytest.mark.parametrize("name", HOSTED)
+def test_host_environments_resume_exactly(name):
+    env, other = (envs.make(name, "host", num_envs=2, seed=seed) for seed in (3, 99))
+    env.episode_length = other.episode_length = 40
+    random = np.random.default_rng(0)
+    env.reset()
+    other.reset()
+    for moment in (1, 30, 39, 40, 7):  # mid-episode, the step before and the very moment of a reset
+        for _ in range(moment):
+            env.step(random.uniform(-1, 1, (2, env.spec.action_size)))
+        np.testing.assert_array_equal(other.load(json.loads(json.dumps(env.save()))), env._obs)
+        for _ in range(60):
+            actions = random.uniform(-1, 1, (2, env.spec.action_size))
+            for ours, theirs in zip(env.step(actions), other.step(actions), strict=True):
+                np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("name", HOSTED)
+def test_host_environments_keep_the_true_successor(name):
+    env = envs.make(name, "host", num_envs=2, seed=0)
+    env.episode_length = 5
+    env.reset()
+    for _ in range(5):
+        step = env.step(np.ones((2, env.spec.action_size)))
+    assert step.truncated.all()
+    assert not step.terminated.any()
+    assert (step.next_obs != step.obs).any(axis=1).all()
+
+
+def test_mistakes_are_named():
+    with pytest.raises(SettingError, match="must be one of ball_in_cup"):
+        envs.make("hoper")
+    with pytest.raises(SettingError, match="backend=gpu: must be auto or mjx or host"):
+        envs.make("hopper", "gpu")
+    with pytest.raises(ValueError, match=r"must have shape \(2, 3\)"):
+        envs.make("hopper", "host", num_envs=2).step(np.zeros((1, 3)))

@@ -1,0 +1,109 @@
+"""D_M^{n,m} comes from model n and policy m, from real states, for the scheduled horizon."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.helpers import algorithm, initial, tiny
+from vecpsmbpo import imagination, replay
+from vecpsmbpo.drivers import over_seeds
+from vecpsmbpo.types import Counters, EnvSpec, Transition
+
+LIMIT = 3.5
+SPEC = EnvSpec(
+    "counter", obs_size=2, action_size=1, episode_length=10, terminated=lambda o, a, n: n[..., 0] > LIMIT
+)
+N, M, ROWS = 3, 2, 40
+
+
+def constant(params, outputs):
+    """Parameters of a network that answers `outputs` [..., K] whatever it is asked."""
+    params = jax.tree.map(jnp.zeros_like, params)
+    last = sorted(name for name in params["params"] if name.startswith("Dense"))[-1]
+    params["params"][last]["bias"] = outputs
+    return params
+
+
+@pytest.fixture(scope="module")
+def imagined():
+    """Every model n adds n + 1 to obs[0] and pays n; every policy (n, m) acts near tanh(index / 10); horizon 3."""
+    settings = tiny(n_models=N, n_policies=M, rollout_starts=8, horizon_first=3, horizon_last=3)
+    learner = algorithm(settings, SPEC)
+    layout = learner.layout
+    specs = layout.specs()
+    state = layout.unpad(_train_state(initial(learner)))
+    seeds = state.seeds
+
+    def model_params(n):
+        quiet = jnp.full(3, -1e3)
+        return jnp.concatenate([jnp.array([n + 1.0, 0.0, n]), quiet])
+
+    outputs = jnp.stack([model_params(n) for n in range(N)])[None]
+    actions = jnp.stack([jnp.array([i / 10, -1e3]) for i in range(N * M)])[None]
+    actor = seeds.agents.actor
+    inner = constant({"params": actor["params"]["ReluMLP_0"]}, actions)["params"]
+    seeds = seeds.replace(
+        models=seeds.models.replace(params=constant(seeds.models.params, outputs)),
+        agents=seeds.agents.replace(actor={"params": {"ReluMLP_0": inner}}),
+        real=_real_rows(seeds.real),
+    )
+    placed = layout.place(state.replace(seeds=seeds)).seeds
+    run = layout.spread(
+        lambda counters, seeds, keys: over_seeds(lambda c, s, k: learner.imagine(c, s, jnp.bool_(True), k))(
+            counters, seeds, keys
+        ),
+        (specs.counters, specs.seeds, specs.seeds.key),
+        specs.seeds,
+    )
+    counters = Counters(jnp.int32(ROWS), jnp.int32(0))
+    after = run(counters, placed, placed.key)
+    rows = after.imagined[0, : N * M, : 3 * imagination.chunk_size(settings)]
+    assert int(learner.imagined_rows(counters, jnp.bool_(True))) == rows.shape[1] == 24
+    return [replay.unpack(member, 2, 1) for member in rows], np.asarray(after.real[0])
+
+
+def _train_state(seeds):
+    from vecpsmbpo.types import TrainState
+
+    return TrainState(Counters(jnp.int32(0), jnp.int32(0)), seeds, jnp.zeros((1, 2)))
+
+
+def _real_rows(ring):
+    """Real states (0, i), i < ROWS; the rest of the ring is poison."""
+    obs = jnp.stack([jnp.zeros(ROWS), jnp.arange(ROWS, dtype=jnp.float32)], axis=1)
+    zero = jnp.zeros(ROWS)
+    rows = replay.pack(Transition(obs, zero[:, None], zero, obs, zero))
+    return jnp.full_like(ring, jnp.nan).at[0, :ROWS].set(rows)
+
+
+def test_every_member_s_data_comes_from_its_own_model(imagined):
+    for member, data in enumerate(imagined[0]):
+        n = member // M
+        # The smallest variance the network can express leaves noise of exp(-5) = 0.0067.
+        np.testing.assert_allclose(data.next_obs[:, 0] - data.obs[:, 0], n + 1, atol=0.04)
+        np.testing.assert_allclose(data.reward, n, atol=0.04)
+
+
+def test_every_member_s_data_comes_from_its_own_policy(imagined):
+    for member, data in enumerate(imagined[0]):
+        np.testing.assert_allclose(data.action[:, 0], np.tanh(member / 10), atol=0.01)
+
+
+def test_rollouts_start_from_stored_real_states_and_go_on_for_the_horizon(imagined):
+    for member, data in enumerate(imagined[0]):
+        first, second = (jax.tree.map(lambda x, s=s: x[s], data) for s in (slice(0, 8), slice(8, 16)))
+        assert np.isin(first.obs[:, 1], np.arange(ROWS)).all()
+        assert (first.obs[:, 0] == 0).all()
+        if member // M < 2:  # models 0 and 1 are below the limit then: the second step goes on from the first
+            np.testing.assert_array_equal(second.obs, first.next_obs)
+
+
+def test_a_rollout_that_terminates_is_stored_and_begins_again_from_a_real_state(imagined):
+    """Model 2 adds 3 to obs[0] and passes the limit of 3.5 at its second step."""
+    data = imagined[0][2 * M]
+    np.testing.assert_array_equal(data.terminated[:8], 0)
+    np.testing.assert_array_equal(data.terminated[8:16], 1)
+    np.testing.assert_allclose(data.next_obs[8:16, 0], 6, atol=0.1)
+    np.testing.assert_array_equal(data.obs[16:24, 0], 0)
+    assert np.isin(data.obs[16:24, 1], np.arange(ROWS)).all()

@@ -1,0 +1,114 @@
+"""Batching changes nothing: vmap, loops, one device or two give the same members."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.helpers import algorithm, initial, tiny
+from vecpsmbpo import sac
+from vecpsmbpo.drivers import over_seeds
+from vecpsmbpo.envs import specs
+from vecpsmbpo.layout import Layout
+from vecpsmbpo.train import initial_inputs
+from vecpsmbpo.types import Counters, TrainState
+
+SPEC = specs.get("ball_in_cup")
+
+
+def learned(settings, layout):
+    """All seeds after one `learn` on random data; unpadded."""
+    learner = dataclasses.replace(algorithm(settings, SPEC), layout=layout)
+    specs_ = layout.specs()
+    state = initial(learner)
+    noise = jax.random.normal(jax.random.key(3), state.real.shape[1:])
+    row = jax.random.normal(jax.random.key(4), state.imagined.shape[2:])
+    state = state.replace(real=state.real + noise, imagined=state.imagined + row)
+    run = layout.spread(
+        lambda c, s: s.replace(agents=over_seeds(learner.learn)(c, s, s.key)),
+        (specs_.counters, specs_.seeds),
+        specs_.seeds,
+    )
+    counters = Counters(jnp.int32(100), jnp.int32(16))
+    return layout.unpad(TrainState(counters, run(counters, state), jnp.zeros((1, 1)))).seeds
+
+
+def _close(a, b, atol=2e-5):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol), a, b)
+
+
+@pytest.fixture(scope="module")
+def reference():
+    """3 members of 1 seed on one device, one after the other."""
+    settings = tiny(n_models=3, n_policies=1, devices=1)
+    return settings, learned(settings, Layout.of(settings))
+
+
+def test_batched_members_equal_members_in_a_loop(reference):
+    settings, looped = reference
+    layout = Layout.of(settings)
+    assert layout.sequential
+    batched = learned(settings, dataclasses.replace(layout, sequential=False))
+    _close(batched.agents, looped.agents)
+
+
+def test_members_on_two_devices_equal_members_on_one(reference):
+    """Three members on two devices are padded to four; the padding shows nowhere."""
+    settings, looped = reference
+    layout = Layout.of(dataclasses.replace(settings, devices=2))
+    assert dict(layout.mesh.shape) == {"seeds": 1, "members": 2}
+    assert layout.padded_members == 4
+    _close(learned(settings, layout).agents, looped.agents)
+
+
+def test_seeds_in_one_program_equal_seeds_alone(reference):
+    settings, alone = reference
+    both = dataclasses.replace(settings, num_seeds=2, devices=2)
+    layout = Layout.of(both)
+    assert dict(layout.mesh.shape) == {"seeds": 2, "members": 1}
+    together = learned(both, layout)
+    _close(jax.tree.map(lambda x: x[:1], together.agents), alone.agents)
+    second = dataclasses.replace(settings, seed=settings.seed + 1)
+    _close(jax.tree.map(lambda x: x[1:], together.agents), learned(second, Layout.of(second)).agents)
+
+
+def test_a_member_learns_as_a_single_agent_would(reference):
+    """The program's member 1 equals `sac.updates` called by hand on the minibatches that it drew."""
+    settings, looped = reference
+    learner = algorithm(settings, SPEC)
+    seeds = initial(learner)
+    noise = jax.random.normal(jax.random.key(3), seeds.real.shape[1:])
+    row = jax.random.normal(jax.random.key(4), seeds.imagined.shape[2:])
+    state = jax.tree.map(
+        lambda x: x[0], seeds.replace(real=seeds.real + noise, imagined=seeds.imagined + row)
+    )
+    batch_key, update_key = jax.random.split(state.key)
+    counters = Counters(jnp.int32(100), jnp.int32(16))
+    batches = learner.minibatches(counters, state, state.imagined[1], jax.random.fold_in(batch_key, 1))
+    agent = jax.tree.map(lambda x: x[1], state.agents)
+    nets = sac.make_networks(settings, SPEC)
+    single = sac.updates(agent, batches, state.hyper, jax.random.fold_in(update_key, 1), nets=nets)
+    _close(single, jax.tree.map(lambda x: x[0, 1], looped.agents))
+
+
+def test_place_is_the_inverse_of_unpad():
+    settings = tiny(n_models=3, n_policies=1, devices=2)
+    layout = Layout.of(settings)
+    learner = algorithm(settings, SPEC)
+    counters = Counters(jnp.int32(0), jnp.int32(0))
+    state = TrainState(counters, initial(learner), jnp.zeros((1, 2)))
+    plain = layout.unpad(state)
+    assert plain.seeds.agents.log_alpha.shape == (1, 3)
+    again = layout.unpad(layout.place(plain))
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(plain), strict=True):
+        if not jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_hyperparameters_are_traced():
+    settings = tiny()
+    keys, hyper = initial_inputs(dataclasses.replace(settings, num_seeds=3))
+    assert keys.shape == (3,)
+    assert {leaf.shape for leaf in jax.tree.leaves(hyper)} == {(3,)}

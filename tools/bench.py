@@ -1,0 +1,187 @@
+"""Measures the program against the machine, as ratios within one run.
+
+    python tools/bench.py updates     SAC updates inside the real program, against the float32 matrix-product peak
+    python tools/bench.py capacity    cost of a step at a large and at a small replay capacity
+    python tools/bench.py program     cost of a step of the whole program, against its SAC updates alone
+
+Further arguments are settings, as for `vecpsmbpo train`. One line of JSON per measurement.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vecpsmbpo import config, runtime
+from vecpsmbpo.drivers import ScanDriver, over_seeds
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.train import initial_inputs, make_driver
+from vecpsmbpo.types import TrainState
+
+PAPER = [
+    "env=hopper",
+    "n_models=4",
+    "n_policies=6",
+    "rollout_starts=4096",
+    "horizon_last=1",
+    "warmup_steps=250",
+]
+SMALL = ["env=cartpole_swingup", "size=cpu", "warmup_steps=250", "rollout_starts=2500"]
+
+
+def best_seconds(run: Callable[[], Any], repeats: int) -> float:
+    """The shortest of several runs: what the machine can do when nothing disturbs it."""
+    seconds = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(run())
+        seconds.append(time.perf_counter() - began)
+    return min(seconds)
+
+
+def matmul_peak(size: int = 2048, repeats: int = 5) -> float:
+    """FLOP/s of a large float32 matrix product on every device at once."""
+    devices = jax.devices()
+    square = jnp.ones((size, size), jnp.float32)
+    product = jax.pmap(lambda x: x @ x) if len(devices) > 1 else jax.jit(lambda x: x[0] @ x[0])
+    operands = jax.device_put_replicated(square, devices) if hasattr(jax, "device_put_replicated") else None
+    if operands is None:
+        mesh = jax.sharding.Mesh(np.array(devices), ("d",))
+        place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("d"))
+        operands = jax.device_put(jnp.broadcast_to(square, (len(devices), size, size)), place)
+        product = jax.jit(
+            jax.shard_map(
+                lambda x: jnp.matmul(x[0], x[0])[None], mesh=mesh, in_specs=place.spec, out_specs=place.spec
+            )
+        )
+    jax.block_until_ready(product(operands))
+    return len(devices) * 2 * size**3 / best_seconds(lambda: product(operands), repeats)
+
+
+def update_flops(settings: Settings, obs: int, action: int) -> float:
+    """Multiply-adds × 2 of one SAC update's matrix products, counted by hand.
+
+    A forward pass of a network of W weights on a batch of B costs 2 B W; its backward pass as much again for the
+    weights and as much again for the inputs. Critic loss: actor and two target critics forward, two critics forward
+    and backward. Actor loss: actor forward and backward, two critics forward and backward to their inputs only.
+    """
+    width, layers = settings.policy_hidden_size, settings.policy_hidden_layers
+    inner = width * width * (layers - 1)
+    actor = obs * width + inner + width * 2 * action
+    critic = (obs + action) * width + inner + width
+    critic_loss = actor + 2 * critic + 2 * 3 * critic
+    actor_loss = 3 * actor + 2 * 2 * critic
+    return 2 * settings.policy_batch_size * (critic_loss + actor_loss)
+
+
+def driver_of(overrides: list[str]) -> ScanDriver:
+    settings = config.compose([*overrides, *sys.argv[2:]])
+    runtime.configure(settings)
+    driver = make_driver(settings)
+    assert isinstance(driver, ScanDriver)
+    return driver
+
+
+def past_warmup(driver: ScanDriver) -> TrainState:
+    """A state whose next periods learn."""
+    settings = driver.settings
+    state, _ = driver.run(
+        driver.init(*initial_inputs(settings)), -(-settings.warmup_steps // settings.model_update_every)
+    )
+    return state
+
+
+def seconds_per_update(driver: ScanDriver, state: TrainState, repeats: int) -> float:
+    """Of G updates of every member, by themselves: `learn` in a jitted loop over the mesh."""
+    steps, specs = 5, driver.layout.specs()
+
+    def body(state: TrainState) -> Any:
+        def step(seeds, _):
+            return seeds.replace(
+                agents=over_seeds(driver.algorithm.learn)(state.counters, seeds, seeds.key)
+            ), None
+
+        return jax.lax.scan(step, state.seeds, None, length=steps)[0].agents
+
+    run = driver.layout.spread(body, (specs,), specs.seeds.agents)
+    jax.block_until_ready(run(state))
+    return best_seconds(lambda: run(state), repeats) / steps
+
+
+def seconds_per_step(driver: ScanDriver, repeats: int) -> float:
+    """Of a step inside the whole program: a chunk that learns, less what its refresh costs.
+
+    The refresh (models, imagination) is measured as a period of the same program in which real data alone is used.
+    """
+    settings = driver.settings
+    keys, hyper = initial_inputs(settings)
+    state = driver.init(keys, hyper.replace(real_ratio=jnp.ones_like(hyper.real_ratio)))  # λ = 1: no refresh
+    state, _ = driver.run(state, -(-settings.warmup_steps // settings.model_update_every))
+    seconds = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        state, _ = driver.run(state, 1)
+        seconds.append(time.perf_counter() - began)
+    return min(seconds) / settings.model_update_every
+
+
+def bench_updates() -> dict[str, Any]:
+    driver = driver_of([*PAPER, "updates_per_step=10", "replay_capacity=20000", "imagined_capacity=20480"])
+    settings, spec = driver.settings, driver.algorithm.spec
+    state = driver.init(*initial_inputs(settings))
+    peaks = [matmul_peak()]
+    seconds = seconds_per_update(driver, state, 3) / settings.updates_per_step
+    peaks.append(matmul_peak())
+    rate = settings.n_members * update_flops(settings, spec.obs_size, spec.action_size) / seconds
+    return {
+        "members": settings.n_members,
+        "width": settings.policy_hidden_size,
+        "batch": settings.policy_batch_size,
+        "ms_per_update_of_all_members": 1e3 * seconds,
+        "member_updates_per_s": settings.n_members / seconds,
+        "gflops": rate / 1e9,
+        "matmul_peak_gflops": max(peaks) / 1e9,
+        "share_of_peak": rate / max(peaks),
+    }
+
+
+def bench_capacity() -> dict[str, Any]:
+    drivers = {
+        size: driver_of([*SMALL, f"replay_capacity={size}", f"imagined_capacity={size}"])
+        for size in (20_000, 1_000_000)
+    }
+    seconds: dict[int, float] = {}
+    for _ in range(3):  # in turn, so that a machine whose speed drifts does not favour one
+        for size, driver in drivers.items():
+            seconds[size] = min(seconds.get(size, np.inf), seconds_per_step(driver, 2))
+    small, large = seconds.values()
+    return {"ms_per_step_at_2e4": 1e3 * small, "ms_per_step_at_1e6": 1e3 * large, "ratio": large / small}
+
+
+def bench_program() -> dict[str, Any]:
+    driver = driver_of(SMALL)
+    state = past_warmup(driver)
+    alone, whole = np.inf, np.inf
+    for _ in range(3):
+        alone = min(alone, seconds_per_update(driver, state, 10))
+        whole = min(whole, seconds_per_step(driver, 2))
+    return {"ms_per_step": 1e3 * whole, "ms_of_updates_alone": 1e3 * alone, "ratio": whole / alone}
+
+
+BENCHES = {"updates": bench_updates, "capacity": bench_capacity, "program": bench_program}
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2 or sys.argv[1] not in BENCHES:
+        sys.exit(f"usage: bench.py {'|'.join(BENCHES)} [setting=value ...]")
+    devices = f"{jax.default_backend()}" if False else None
+    result = BENCHES[sys.argv[1]]()
+    print(
+        json.dumps(
+            {"bench": sys.argv[1], "devices": jax.device_count(), "backend": jax.default_backend(), **result}
+        )
+    )
