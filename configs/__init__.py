@@ -1,1 +1,1 @@
-"""Hydra configuration groups: env/ (Table 1), algo/, size/, and tuned/ where a size needs numbers of its own for a task."""
+"""Hydra configuration groups: env/ (Table 1), algo/, size/; tuned/ where a task has numbers of its own at a size."""

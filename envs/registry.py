@@ -37,9 +37,7 @@ class Task:
 
 TASKS = {
     "ball_in_cup": Task(8, 2, 1000, "dm_control", "ball_in_cup:BallInCup", "dm_control:ball_in_cup"),
-    "cartpole_swingup": Task(
-        5, 1, 1000, "dm_control", "cartpole:CartpoleSwingup", "dm_control:cartpole_swingup"
-    ),
+    "cartpole_swingup": Task(5, 1, 1000, "dm_control", "cartpole:CartpoleSwingup", "dm_control:cartpole_swingup"),
     "cartpole_swingup_sparse": Task(
         5, 1, 1000, "dm_control", "cartpole:CartpoleSwingupSparse", "dm_control:cartpole_swingup_sparse"
     ),

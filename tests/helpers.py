@@ -32,9 +32,7 @@ def initial(algorithm: PsMbpo) -> SeedState:
     return init(*initial_inputs(algorithm.settings))
 
 
-def command(
-    *arguments: str, cwd: Path, one_thread: bool = False, **kwargs: Any
-) -> subprocess.CompletedProcess:
+def command(*arguments: str, cwd: Path, one_thread: bool = False, **kwargs: Any) -> subprocess.CompletedProcess:
     """Runs `vecpsmbpo` as a user would."""
     return subprocess.run(
         argv(*arguments, one_thread=one_thread),

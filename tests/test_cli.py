@@ -87,9 +87,7 @@ def test_a_run_directory_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     result = command("train", "size=tiny", "run_dir=file/run", cwd=tmp_path)
     assert result.returncode == 2
-    assert (
-        result.stderr.splitlines()[-1] == "vecpsmbpo: run_dir=file/run: cannot be written (Not a directory)"
-    )
+    assert result.stderr.splitlines()[-1] == "vecpsmbpo: run_dir=file/run: cannot be written (Not a directory)"
 
 
 def test_every_setting_has_a_default_and_says_what_it_may_be():
@@ -139,9 +137,7 @@ def test_the_command_line_wins():
 
 
 def test_the_default_run_directory_tells_runs_apart():
-    names = {
-        config.compose(chosen).run_dir for chosen in ([], ["seed=1"], ["real_ratio=0.5"], ["real_ratio=0"])
-    }
+    names = {config.compose(chosen).run_dir for chosen in ([], ["seed=1"], ["real_ratio=0.5"], ["real_ratio=0"])}
     assert len(names) == 4
     assert config.compose(["total_steps=9000"]).run_dir == config.compose([]).run_dir
 

@@ -49,9 +49,7 @@ def make_driver(kind, terminates, settings):
     return HostDriver(learner, partial(probes.host, terminates))
 
 
-@pytest.fixture(
-    scope="module", params=[("scan", False), ("scan", True), ("host", False), ("host", True)], ids=str
-)
+@pytest.fixture(scope="module", params=[("scan", False), ("scan", True), ("host", False), ("host", True)], ids=str)
 def trained(request):
     kind, terminates = request.param
     settings = settings_for()
@@ -74,16 +72,14 @@ def _value(driver, state, member, obs):
     nets = sac.make_networks(driver.settings, driver.algorithm.spec)
     agent = jax.tree.map(lambda x: x[0, member], state.seeds.agents)
     obs = jnp.array([obs])
-    return float(
-        jnp.minimum(*nets.critic.apply(agent.critic, obs, nets.actor.apply(agent.actor, obs).mode()))
-    )
+    return float(jnp.minimum(*nets.critic.values(agent.critic, obs, nets.actor.law(agent.actor, obs).mode())))
 
 
 def test_policies_are_optimal(trained):
     settings, driver, _, state, _ = trained
     nets = sac.make_networks(settings, driver.algorithm.spec)
     actors = jax.tree.map(lambda x: x[0], state.seeds.agents.actor)
-    actions = jax.vmap(lambda actor: nets.actor.apply(actor, jnp.ones(1)).mode())(actors)
+    actions = jax.vmap(lambda actor: nets.actor.law(actor, jnp.ones(1)).mode())(actors)
     assert np.abs(actions[: settings.n_members]).max() < 0.35  # reward 1 - a²: at least 0.88 of the best
 
 
@@ -203,9 +199,7 @@ def test_other_evaluation_policies(policy):
     actor["params"]["ReluMLP_0"]["Dense_2"]["bias"] = bias
     posterior = state.seeds.posterior.replace(returns=jnp.array([[0.0, 9e9, 0, 0]]))
     seeds = state.seeds.replace(agents=state.seeds.agents.replace(actor=actor), posterior=posterior)
-    returns = driver.evaluate(
-        driver.layout.place(state.replace(seeds=seeds)), evaluation_keys(settings, 0), 1
-    )
+    returns = driver.evaluate(driver.layout.place(state.replace(seeds=seeds)), evaluation_keys(settings, 0), 1)
     actions = np.tanh(np.arange(4) / 4)
     action = actions[1] if policy == "best" else actions.mean()
     assert nets.actor.action_size == 1

@@ -9,9 +9,7 @@ from tests.helpers import tiny
 from vecpsmbpo import dynamics, replay
 from vecpsmbpo.types import EnvSpec, Hyper, Moments, Transition
 
-SPEC = EnvSpec(
-    "linear", obs_size=2, action_size=1, episode_length=10, terminated=lambda o, a, n: n[..., 0] > 9
-)
+SPEC = EnvSpec("linear", obs_size=2, action_size=1, episode_length=10, terminated=lambda o, a, n: n[..., 0] > 9)
 CAPACITY = 2048
 
 
@@ -45,15 +43,13 @@ def fit(linear):
         moments = Moments(inputs.mean(0), ((inputs - inputs.mean(0)) ** 2).sum(0))
         whitening = dynamics.scaling(moments, jnp.int32(CAPACITY))
         hyper = Hyper.of(settings)
-        return dynamics.fit(
-            model, rows, split, whitening, hyper, key, max_epochs, settings=settings, spec=SPEC
-        )
+        return dynamics.fit(model, rows, split, whitening, hyper, key, max_epochs, settings=settings, spec=SPEC)
 
     return run
 
 
 def test_fit_learns_the_mean_and_the_noise(linear, fit, key):
-    settings, rows = linear
+    settings, _ = linear
     model = dynamics.init(key, settings, SPEC)
     fitted = fit(model, jnp.int32(CAPACITY), jnp.int32(200), key)
     obs, action = jnp.array([[0.5, -0.5]]), jnp.array([[1.0]])
@@ -88,9 +84,7 @@ def test_the_best_parameters_are_restored(linear, fit, key):
     split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
     hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(1.0))
     whitening = (model.input_mean, model.input_std)
-    after = dynamics.fit(
-        model, rows, split, whitening, hyper, key, jnp.int32(20), settings=settings, spec=SPEC
-    )
+    after = dynamics.fit(model, rows, split, whitening, hyper, key, jnp.int32(20), settings=settings, spec=SPEC)
     jax.tree.map(np.testing.assert_array_equal, after.params, model.params)
     steps = jax.tree.leaves(after.optimizer)[0] - jax.tree.leaves(model.optimizer)[0]
     per_epoch = -(-CAPACITY // 5 * 4 // settings.model_batch_size)
@@ -106,9 +100,7 @@ def test_split_is_a_partition_with_one_row_in_five_validating(key):
     assert len(validation) == len(np.unique(validation)) == 200
     assert not set(validation) & set(train.tolist())
     assert set(validation) | set(train.tolist()) == set(range(1000))
-    again, _ = dynamics.Split.draw(jax.random.key(1), jnp.int32(rows), CAPACITY, block).validation_rows(
-        0, 200, block
-    )
+    again, _ = dynamics.Split.draw(jax.random.key(1), jnp.int32(rows), CAPACITY, block).validation_rows(0, 200, block)
     assert set(validation) != set(np.asarray(again).tolist())
 
 

@@ -18,9 +18,7 @@ def test_negative_log_likelihood_is_that_of_a_normal_without_its_constant():
     assert value == pytest.approx(np.log(4) / 2 + 9 / 8)
     mean, log_variance, target = np.random.default_rng(0).normal(size=(3, 100))
     expected = -scipy.stats.norm.logpdf(target, mean, np.exp(log_variance / 2)) - np.log(2 * np.pi) / 2
-    np.testing.assert_allclose(
-        dynamics.negative_log_likelihood(mean, log_variance, target), expected, rtol=1e-5
-    )
+    np.testing.assert_allclose(dynamics.negative_log_likelihood(mean, log_variance, target), expected, rtol=1e-5)
 
 
 def test_log_variance_is_clamped_softly(key):
@@ -81,9 +79,7 @@ def test_optimistic_probabilities_by_hand():
 
 def test_infinite_temperature_is_uniform():
     earned = Posterior(jnp.array([1e6, 0.0, -1e6]), jnp.zeros(3))
-    np.testing.assert_array_equal(
-        jax.nn.softmax(posterior.logits(earned, jnp.inf)), np.full(3, 1 / 3, np.float32)
-    )
+    np.testing.assert_array_equal(jax.nn.softmax(posterior.logits(earned, jnp.inf)), np.full(3, 1 / 3, np.float32))
 
 
 def test_members_are_drawn_with_the_probabilities_of_equation_19():

@@ -11,9 +11,7 @@ from vecpsmbpo.drivers import over_seeds
 from vecpsmbpo.types import Counters, EnvSpec, Transition
 
 LIMIT = 3.5
-SPEC = EnvSpec(
-    "counter", obs_size=2, action_size=1, episode_length=10, terminated=lambda o, a, n: n[..., 0] > LIMIT
-)
+SPEC = EnvSpec("counter", obs_size=2, action_size=1, episode_length=10, terminated=lambda o, a, n: n[..., 0] > LIMIT)
 N, M, ROWS = 3, 2, 40
 
 

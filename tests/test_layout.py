@@ -81,9 +81,7 @@ def test_a_member_learns_as_a_single_agent_would(reference):
     seeds = initial(learner)
     noise = jax.random.normal(jax.random.key(3), seeds.real.shape[1:])
     row = jax.random.normal(jax.random.key(4), seeds.imagined.shape[2:])
-    state = jax.tree.map(
-        lambda x: x[0], seeds.replace(real=seeds.real + noise, imagined=seeds.imagined + row)
-    )
+    state = jax.tree.map(lambda x: x[0], seeds.replace(real=seeds.real + noise, imagined=seeds.imagined + row))
     batch_key, update_key = jax.random.split(state.key)
     counters = Counters(jnp.int32(100), jnp.int32(16))
     batches = learner.minibatches(counters, state, state.imagined[1], jax.random.fold_in(batch_key, 1))

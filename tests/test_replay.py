@@ -51,9 +51,7 @@ def test_only_stored_rows_are_drawn(key):
 @pytest.mark.parametrize("real_ratio", [0.0, 0.05, 0.5, 1.0])
 def test_each_row_of_a_minibatch_is_real_with_probability_lambda(key, real_ratio):
     """Footnote 2: per row, not per batch."""
-    settings = tiny(
-        n_models=1, n_policies=1, policy_batch_size=500, updates_per_step=40, real_ratio=real_ratio
-    )
+    settings = tiny(n_models=1, n_policies=1, policy_batch_size=500, updates_per_step=40, real_ratio=real_ratio)
     learner = algorithm(settings, probes.spec(terminates=False))
     state = jax.tree.map(lambda x: x[0], initial(learner))
     state = state.replace(real=jnp.ones_like(state.real))

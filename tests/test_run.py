@@ -53,9 +53,7 @@ def check_log(run_dir: Path, settings) -> None:
     epochs = metrics.read(run_dir / "metrics.jsonl")
     seeds = range(settings.seed, settings.seed + settings.num_seeds)
     steps = range(settings.epoch_steps, settings.total_steps + 1, settings.epoch_steps)
-    assert sorted((line["env_steps"], line["seed"]) for line in epochs) == [
-        (t, s) for t in steps for s in seeds
-    ]
+    assert sorted((line["env_steps"], line["seed"]) for line in epochs) == [(t, s) for t in steps for s in seeds]
     assert all(set(line) >= METRICS for line in epochs)
     episodes = metrics.read(run_dir / "episodes.jsonl")
     for seed in seeds:
@@ -106,9 +104,7 @@ def test_a_run_killed_again_and_again_is_the_undisturbed_run(undisturbed, tmp_pa
     random = np.random.default_rng(0)
     kills = 0
     for _ in range(3):
-        process = subprocess.Popen(
-            arguments, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, text=True
-        )
+        process = subprocess.Popen(arguments, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, text=True)
         for line in process.stdout:  # compiling takes most of the time: wait for the work to begin
             if "compiled in" in line:
                 break
@@ -224,9 +220,7 @@ def test_divergence_stops_the_run_and_says_where(short_run, tmp_path, monkeypatc
         state, news = run(self, state, periods)
         if int(state.counters.env_steps) == 80:
             alpha = state.seeds.agents.log_alpha.at[0, 3].set(jnp.nan)
-            state = state.replace(
-                seeds=state.seeds.replace(agents=state.seeds.agents.replace(log_alpha=alpha))
-            )
+            state = state.replace(seeds=state.seeds.replace(agents=state.seeds.agents.replace(log_alpha=alpha)))
         return state, news
 
     monkeypatch.setattr(train.HostDriver, "run", poisoned)
@@ -246,9 +240,7 @@ def test_a_full_disk_is_one_line_and_keeps_the_last_checkpoint(tmp_path):
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], check=False).returncode:
         pytest.skip("this sandbox does not let root mount")
     try:
-        result = command(
-            "train", "env=ball_in_cup", "backend=host", "size=tiny", f"run_dir={disk}/run", cwd=tmp_path
-        )
+        result = command("train", "env=ball_in_cup", "backend=host", "size=tiny", f"run_dir={disk}/run", cwd=tmp_path)
         assert result.returncode == 2, result.stderr
         expected = f"vecpsmbpo: run_dir={disk}/run: cannot be written (No space left on device)"
         assert result.stderr.splitlines()[-1] == expected

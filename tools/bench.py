@@ -46,21 +46,13 @@ def best_seconds(run: Callable[[], Any], repeats: int) -> float:
 
 def matmul_peak(size: int = 2048, repeats: int = 5) -> float:
     """FLOP/s of a large float32 matrix product on every device at once."""
-    devices = jax.devices()
-    square = jnp.ones((size, size), jnp.float32)
-    product = jax.pmap(lambda x: x @ x) if len(devices) > 1 else jax.jit(lambda x: x[0] @ x[0])
-    operands = jax.device_put_replicated(square, devices) if hasattr(jax, "device_put_replicated") else None
-    if operands is None:
-        mesh = jax.sharding.Mesh(np.array(devices), ("d",))
-        place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("d"))
-        operands = jax.device_put(jnp.broadcast_to(square, (len(devices), size, size)), place)
-        product = jax.jit(
-            jax.shard_map(
-                lambda x: jnp.matmul(x[0], x[0])[None], mesh=mesh, in_specs=place.spec, out_specs=place.spec
-            )
-        )
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("devices",))
+    spec = jax.sharding.PartitionSpec("devices")
+    squares = jnp.ones((mesh.size, size, size), jnp.float32)
+    operands = jax.device_put(squares, jax.sharding.NamedSharding(mesh, spec))
+    product = jax.jit(jax.shard_map(lambda x: x @ x, mesh=mesh, in_specs=spec, out_specs=spec))
     jax.block_until_ready(product(operands))
-    return len(devices) * 2 * size**3 / best_seconds(lambda: product(operands), repeats)
+    return mesh.size * 2 * size**3 / best_seconds(lambda: product(operands), repeats)
 
 
 def update_flops(settings: Settings, obs: int, action: int) -> float:
@@ -102,9 +94,7 @@ def seconds_per_update(driver: ScanDriver, state: TrainState, repeats: int) -> f
 
     def body(state: TrainState) -> Any:
         def step(seeds, _):
-            return seeds.replace(
-                agents=over_seeds(driver.algorithm.learn)(state.counters, seeds, seeds.key)
-            ), None
+            return seeds.replace(agents=over_seeds(driver.algorithm.learn)(state.counters, seeds, seeds.key)), None
 
         return jax.lax.scan(step, state.seeds, None, length=steps)[0].agents
 
@@ -178,10 +168,5 @@ BENCHES = {"updates": bench_updates, "capacity": bench_capacity, "program": benc
 if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in BENCHES:
         sys.exit(f"usage: bench.py {'|'.join(BENCHES)} [setting=value ...]")
-    devices = f"{jax.default_backend()}" if False else None
     result = BENCHES[sys.argv[1]]()
-    print(
-        json.dumps(
-            {"bench": sys.argv[1], "devices": jax.device_count(), "backend": jax.default_backend(), **result}
-        )
-    )
+    print(json.dumps({"bench": sys.argv[1], "devices": jax.device_count(), "backend": jax.default_backend(), **result}))

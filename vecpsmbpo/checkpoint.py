@@ -65,9 +65,7 @@ class Checkpoints:
             try:
                 items = self._manager.restore(
                     step,
-                    args=ocp.args.Composite(
-                        state=ocp.args.StandardRestore(plain), host=ocp.args.JsonRestore()
-                    ),
+                    args=ocp.args.Composite(state=ocp.args.StandardRestore(plain), host=ocp.args.JsonRestore()),
                 )
             except Exception as error:  # whatever a damaged file makes orbax raise
                 _log.debug("checkpoint %d", step, exc_info=error)

@@ -106,9 +106,7 @@ def _envs(rest: list[str]) -> int:
     table = Table("task", "backends", "obs", "action", "episode", "suite", "installed", box=None)
     for name, task in TASKS.items():
         row = (task.obs_size, task.action_size, task.episode_length)
-        table.add_row(
-            name, ", ".join(task.backends), *map(str, row), task.suite, "yes" if task.installed else "no"
-        )
+        table.add_row(name, ", ".join(task.backends), *map(str, row), task.suite, "yes" if task.installed else "no")
     Console(width=120).print(table)
     return 0
 

@@ -129,9 +129,7 @@ class ScanDriver:
         specs = self.layout.specs()
         self._init = self.layout.spread(self._init_local, (_BY_SEED, _BY_SEED), specs)
         self._run = self.layout.spread(self._run_local, (specs, _SHARED), (specs, _LOG), donate_argnums=0)
-        self._evaluate = self.layout.spread(
-            self._evaluate_local, (specs.seeds, _BY_SEED), (_BY_SEED, _BY_SEED)
-        )
+        self._evaluate = self.layout.spread(self._evaluate_local, (specs.seeds, _BY_SEED), (_BY_SEED, _BY_SEED))
         self._compiled: Any = None
         self._compiled_evaluate: Any = None
 
@@ -142,9 +140,7 @@ class ScanDriver:
         began = time.perf_counter()
         keys = jax.eval_shape(lambda key: _split(key, self.settings.eval_episodes), state.seeds.key)
         lowered = (self._run.lower(state, jnp.int32(1)), self._evaluate.lower(state.seeds, keys))
-        with (
-            ThreadPoolExecutor() as pool
-        ):  # XLA compiles outside of Python's lock: together they cost the longer one
+        with ThreadPoolExecutor() as pool:  # XLA compiles outside of Python's lock: together they cost the longer one
             self._compiled, self._compiled_evaluate = pool.map(lambda program: program.compile(), lowered)
         self.compile_seconds = time.perf_counter() - began
 
@@ -251,9 +247,7 @@ class HostDriver:
         specs, seeds = self.layout.specs(), self.layout.specs().seeds
         spread = self.layout.spread
         self._init = spread(self._init_local, (_BY_SEED, _BY_SEED, _BY_SEED), specs)
-        self._begin = spread(
-            lambda state: begin_period(algorithm, state), (specs,), (specs, _SHARED), donate_argnums=0
-        )
+        self._begin = spread(lambda state: begin_period(algorithm, state), (specs,), (specs, _SHARED), donate_argnums=0)
         self._act = spread(self._act_local, (seeds, _BY_SEED), (_BY_SEED, _BY_SEED))
         self._observe = spread(
             self._observe_local,
@@ -285,9 +279,8 @@ class HostDriver:
         obs = state.env
         action, keys = self._act(state.seeds, obs)
         step = self._env.step(np.asarray(action))
-        transition = Transition(
-            obs, action, step.reward, step.next_obs, np.asarray(step.terminated, np.float32)
-        )
+        terminated = step.terminated.astype(np.float32)
+        transition = Transition(*map(jnp.asarray, (obs, action, step.reward, step.next_obs, terminated)))
         state, end = self._observe(state, transition, step.truncated, keys, step.obs, learning)
         return state, jax.tree.map(np.asarray, end)
 

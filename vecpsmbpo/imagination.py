@@ -7,9 +7,7 @@ from vecpsmbpo import dynamics, replay, sac
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EnvSpec, Model, Params, Transition
 
-LARGEST_CHUNK = (
-    4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
-)
+LARGEST_CHUNK = 4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
 
 
 def chunk_size(settings: Settings) -> int:
@@ -63,7 +61,7 @@ def step(
         (equation 21), and the task's own termination rule.
     """
     action_key, model_key = jax.random.split(key)
-    action, _ = sac.make_networks(settings, spec).actor.apply(actor, obs).sample(action_key)
+    action, _ = sac.make_networks(settings, spec).actor.law(actor, obs).sample(action_key)
     net = dynamics.network(settings, spec)
     next_obs, reward = dynamics.predict(model, obs, action, model_key, net=net)
     return Transition(obs, action, reward, next_obs, spec.terminated(obs, action, next_obs))

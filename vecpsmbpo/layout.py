@@ -119,9 +119,7 @@ class Layout:
         index = member - jax.lax.axis_index(MEMBERS) * local
         here = (index >= 0) & (index < local)
         index = jnp.clip(index, 0, local - 1)
-        answer = function(
-            jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, index, keepdims=False), tree)
-        )
+        answer = function(jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, index, keepdims=False), tree))
         masked = jax.tree.map(lambda x: jnp.where(here, x, jnp.zeros_like(x)), answer)
         return jax.lax.psum(masked, MEMBERS)
 
@@ -139,21 +137,18 @@ class Layout:
 
     def specs(self) -> TrainState:
         """Where every part of a train state lies: a prefix of its tree."""
-        seeds: Any = SeedState(**dict.fromkeys(SeedState.__dataclass_fields__, _BY_SEED))
-        seeds = seeds.replace(models=_BY_MEMBER, agents=_BY_MEMBER, imagined=_BY_MEMBER)
-        return TrainState(counters=PartitionSpec(), seeds=seeds, env=_BY_SEED)  # type: ignore[arg-type]
+        parts: dict[str, Any] = dict.fromkeys(SeedState.__dataclass_fields__, _BY_SEED)
+        parts.update(models=_BY_MEMBER, agents=_BY_MEMBER, imagined=_BY_MEMBER)
+        shared: Any = PartitionSpec()
+        return TrainState(counters=shared, seeds=SeedState(**parts), env=_BY_SEED)
 
-    def spread(self, function: Callable, in_specs: Any, out_specs: Any, **jit: Any) -> Callable:
+    def spread(self, function: Callable, in_specs: Any, out_specs: Any, **jit: Any) -> Any:
         """`function` of a device's part, jitted over the whole mesh."""
         # Replication along `members` holds by construction (equal inputs, equal programs); jax's static check of it
         # cannot follow MJX's while loops.
-        body = jax.shard_map(
-            function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
-        )
+        body = jax.shard_map(function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
         # Shardings are stated, not inferred, so that a fresh and a resumed run are one program to the cache.
-        return jax.jit(
-            body, in_shardings=self._placed(in_specs), out_shardings=self._placed(out_specs), **jit
-        )
+        return jax.jit(body, in_shardings=self._placed(in_specs), out_shardings=self._placed(out_specs), **jit)
 
     def _placed(self, specs: Any) -> Any:
         return jax.tree.map(

@@ -44,9 +44,7 @@ class RunLog:
     def _scalars(self, line: Line, names: Iterable[str], group: str) -> None:
         for name in names:
             if line[name] is not None:
-                self._tensorboard.add_scalar(
-                    f"{group}/{name}/seed{line['seed']}", line[name], line["env_steps"]
-                )
+                self._tensorboard.add_scalar(f"{group}/{name}/seed{line['seed']}", line[name], line["env_steps"])
 
     def close(self) -> None:
         self._tensorboard.close()
@@ -87,10 +85,7 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
     """
     lines = []
     for step, seed in zip(*np.nonzero(news.done), strict=True):
-        here = [
-            np.asarray(leaf)[step, seed]
-            for leaf in (news.index, news.member, news.episode_return, news.length)
-        ]
+        here = [np.asarray(leaf)[step, seed] for leaf in (news.index, news.member, news.episode_return, news.length)]
         index, member, episode_return, length = here
         terminated = bool(news.terminated[step, seed])
         lines.append(
@@ -114,9 +109,7 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
 def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     """What the train state says of the epoch that has just ended, one line per seed. Null: there was nothing yet."""
     seeds = state.seeds
-    stats = {
-        name: np.asarray(value)[:, : settings.n_members] for name, value in vars(seeds.agents.stats).items()
-    }
+    stats = {name: np.asarray(value)[:, : settings.n_members] for name, value in vars(seeds.agents.stats).items()}
     updates = stats.pop("updates")
     env_steps = int(state.counters.env_steps)
     learned = updates[:, 0] > 0

@@ -1,10 +1,12 @@
 """The three networks of the paper: dynamics (A.1), actor and twin critic (A.2)."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+
+from vecpsmbpo.types import Params
 
 MIN_LOG_VARIANCE, MAX_LOG_VARIANCE = -10.0, 2.0
 MIN_SCALE = 1e-3  # Acme's floor under the standard deviation of the policy
@@ -81,6 +83,11 @@ class Actor(nn.Module):
         loc, raw_scale = jnp.split(outputs, 2, axis=-1)
         return TanhGaussian(loc, nn.softplus(raw_scale) + MIN_SCALE)
 
+    def law(self, params: Params, obs: jax.Array) -> TanhGaussian:
+        """π(· | obs) of these parameters."""
+        law: Any = self.apply(params, obs)
+        return law
+
 
 class TwinCritic(nn.Module):
     """Two independent Q(s, a)."""
@@ -95,3 +102,8 @@ class TwinCritic(nn.Module):
         first = ReluMLP(1, self.hidden_size, self.hidden_layers, name="first")(inputs)
         second = ReluMLP(1, self.hidden_size, self.hidden_layers, name="second")(inputs)
         return first[..., 0], second[..., 0]
+
+    def values(self, params: Params, obs: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Q_1, Q_2 [...] of these parameters."""
+        values: Any = self.apply(params, obs, action)
+        return values

@@ -10,9 +10,7 @@ def init(members: int) -> Posterior:
     return Posterior(returns=jnp.zeros(members), compensation=jnp.zeros(members))
 
 
-def credit(
-    posterior: Posterior, member: jax.Array, episode_return: jax.Array, counts: jax.Array
-) -> Posterior:
+def credit(posterior: Posterior, member: jax.Array, episode_return: jax.Array, counts: jax.Array) -> Posterior:
     """Adds an episode's return to its member where `counts` (equation 19 sums over all past episodes).
 
     Compensated (Kahan) addition: after hundreds of episodes of thousands, plain float32 sums would be off by more

@@ -41,7 +41,7 @@ def add(ring: jax.Array, rows: jax.Array, added: jax.Array) -> jax.Array:
     B must divide C, and every earlier block must have been of B rows too: a block never wraps.
     """
     position = added % ring.shape[-2]
-    start = (*(0,) * (ring.ndim - 2), position, 0)
+    start = [jnp.int32(0)] * (ring.ndim - 2) + [position, jnp.int32(0)]
     return jax.lax.dynamic_update_slice(ring, rows, start)
 
 

@@ -17,12 +17,8 @@ GIB = 2**30
 def state_bytes(layout: Layout, shapes: Any) -> int:
     """Bytes that a train state of these shapes takes on the whole mesh, replicas included."""
     total = 0
-    for leaf, sharding in zip(
-        jax.tree.leaves(shapes), jax.tree.leaves(layout.shardings(shapes)), strict=True
-    ):
-        split = {
-            axis for part in sharding.spec if part for axis in ((part,) if isinstance(part, str) else part)
-        }
+    for leaf, sharding in zip(jax.tree.leaves(shapes), jax.tree.leaves(layout.shardings(shapes)), strict=True):
+        split = {axis for part in sharding.spec if part for axis in ((part,) if isinstance(part, str) else part)}
         replicas = np.prod([layout.mesh.shape[axis] for axis in (SEEDS, MEMBERS) if axis not in split])
         size = 8 if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf.dtype.itemsize
         total += int(np.prod(leaf.shape, dtype=np.int64)) * size * int(replicas)

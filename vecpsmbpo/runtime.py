@@ -26,9 +26,7 @@ def configure(settings: Settings) -> None:
     if "xla_force_host_platform_device_count" not in flags:
         try:
             jax.config.update("jax_num_cpu_devices", useful)
-        except (
-            RuntimeError
-        ):  # a backend is there already: a program that imports this package set it up its own way
+        except RuntimeError:  # a backend is there already: a program that imports this package set it up its own way
             logging.getLogger(__name__).debug("JAX is already initialised; its devices are used as they are")
     if settings.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(cache_dir()))

@@ -59,11 +59,11 @@ def critic_loss(
     critic: Params, agent: Agent, batch: Transition, discount: jax.Array, key: jax.Array, *, nets: Networks
 ) -> tuple[jax.Array, jax.Array]:
     """½ (Q - Q̂)² for both critics (equation 27), and the mean of Q over the batch."""
-    next_action, next_log_prob = nets.actor.apply(agent.actor, batch.next_obs).sample(key)
-    next_q = jnp.minimum(*nets.critic.apply(agent.target_critic, batch.next_obs, next_action))
+    next_action, next_log_prob = nets.actor.law(agent.actor, batch.next_obs).sample(key)
+    next_q = jnp.minimum(*nets.critic.values(agent.target_critic, batch.next_obs, next_action))
     alpha = jnp.exp(agent.log_alpha)
     target = target_value(batch.reward, batch.terminated, next_q, next_log_prob, alpha, discount)
-    first, second = nets.critic.apply(critic, batch.obs, batch.action)
+    first, second = nets.critic.values(critic, batch.obs, batch.action)
     return 0.5 * jnp.mean((first - target) ** 2 + (second - target) ** 2), jnp.mean(first)
 
 
@@ -71,8 +71,8 @@ def actor_loss(
     actor: Params, critic: Params, alpha: jax.Array, obs: jax.Array, key: jax.Array, *, nets: Networks
 ) -> tuple[jax.Array, jax.Array]:
     """E[α log π(a | s) - min Q(s, a)] (equations 25 and 28), and the mean log-probability."""
-    action, log_prob = nets.actor.apply(actor, obs).sample(key)
-    q = jnp.minimum(*nets.critic.apply(critic, obs, action))
+    action, log_prob = nets.actor.law(actor, obs).sample(key)
+    q = jnp.minimum(*nets.critic.values(critic, obs, action))
     return jnp.mean(alpha * log_prob - q), jnp.mean(log_prob)
 
 
@@ -93,9 +93,7 @@ def update(agent: Agent, batch: Transition, hyper: Hyper, key: jax.Array, *, net
 
     alpha = jnp.exp(agent.log_alpha)
     actor_value_and_grad = jax.value_and_grad(actor_loss, has_aux=True)
-    (loss_pi, log_prob), gradient = actor_value_and_grad(
-        agent.actor, critic, alpha, batch.obs, actor_key, nets=nets
-    )
+    (loss_pi, log_prob), gradient = actor_value_and_grad(agent.actor, critic, alpha, batch.obs, actor_key, nets=nets)
     actor, actor_optimizer = optim.step(gradient, agent.actor_optimizer, agent.actor, rate)
 
     # ∂/∂(log α) of E[-α (log π + target entropy)]: entropy below its target raises α.

@@ -102,9 +102,7 @@ class Settings:
 FIELDS = {field.name: field for field in dataclasses.fields(Settings)}
 
 # Settings that a resumed run may change: they steer the loop around the run, not what it computes.
-CHANGEABLE = frozenset(
-    {"total_steps", "eval_episodes", "eval_policy", "checkpoint_every", "devices", "compile_cache"}
-)
+CHANGEABLE = frozenset({"total_steps", "eval_episodes", "eval_policy", "checkpoint_every", "devices", "compile_cache"})
 
 
 def allowed(name: str) -> str:
@@ -112,15 +110,12 @@ def allowed(name: str) -> str:
     field = FIELDS[name]
     if choices := field.metadata.get("choices"):
         return "one of " + ", ".join(choices)
-    kind = {int: "a whole number", float: "a number", bool: "true or false", str: "a name"}[field.type]
+    kinds: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a name"}
+    kind = kinds[field.type]
     low, high = field.metadata.get("range", (None, None))
     above = "above" if field.metadata.get("open_low") else "at least"
     if low is not None and high is not None:
-        return (
-            f"{kind} from {low} to {high}"
-            if above == "at least"
-            else f"{kind} above {low} and at most {high}"
-        )
+        return f"{kind} from {low} to {high}" if above == "at least" else f"{kind} above {low} and at most {high}"
     return kind if low is None else f"{kind}, {above} {low}"
 
 

@@ -25,9 +25,7 @@ from vecpsmbpo.progress import Display, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.types import Hyper, TrainState
 
-LONG_EPOCH_S = (
-    20.0  # an epoch that takes longer is run period by period, to show progress and to heed signals
-)
+LONG_EPOCH_S = 20.0  # an epoch that takes longer is run period by period, to show progress and to heed signals
 
 
 class Diverged(Exception):
@@ -107,9 +105,7 @@ class _Run:
             with self.display:
                 self._introduce()
                 if self.env_steps >= settings.total_steps:
-                    self.display.say(
-                        f"already complete at {self.env_steps} steps; raise total_steps to go on"
-                    )
+                    self.display.say(f"already complete at {self.env_steps} steps; raise total_steps to go on")
                     return 0
                 if self.saved_step is None:
                     self._save()  # also shows at once, and not after hours, that there is room on the disk
@@ -267,9 +263,7 @@ def _disk_errors(run_dir: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise SettingError(
-            f"run_dir={run_dir}: cannot be written ({os.strerror(error.errno or errno.EIO)})"
-        ) from error
+        raise SettingError(f"run_dir={run_dir}: cannot be written ({os.strerror(error.errno or errno.EIO)})") from error
     except ValueError as error:  # orbax's storage layer reports a full disk so
         if "No space left" not in str(error) and "RESOURCE_EXHAUSTED" not in str(error):
             raise

@@ -50,8 +50,7 @@ class Transition(NamedTuple):
     terminated: jax.Array
 
 
-@struct.dataclass
-class Hyper:
+class Hyper(struct.PyTreeNode):
     """What may be swept as a number: traced leaves, scalars here and [S] in a train state."""
 
     model_learning_rate: jax.Array
@@ -68,8 +67,7 @@ class Hyper:
         return cls(**{name: jnp.float32(getattr(settings, name)) for name in cls.__dataclass_fields__})
 
 
-@struct.dataclass
-class Model:
+class Model(struct.PyTreeNode):
     """One dynamics model.
 
     Attributes:
@@ -88,8 +86,7 @@ class Model:
     val_mse: jax.Array
 
 
-@struct.dataclass
-class AgentStats:
+class AgentStats(struct.PyTreeNode):
     """Sums over this epoch's SAC updates of one member; every leaf []."""
 
     updates: jax.Array
@@ -100,8 +97,7 @@ class AgentStats:
     entropy: jax.Array
 
 
-@struct.dataclass
-class Agent:
+class Agent(struct.PyTreeNode):
     """One soft actor-critic: networks, target, temperature α, and the state of Adam for each."""
 
     actor: Params
@@ -114,8 +110,7 @@ class Agent:
     stats: AgentStats
 
 
-@struct.dataclass
-class Posterior:
+class Posterior(struct.PyTreeNode):
     """q(π | D, λ), as far as it has memory: what each member has earned.
 
     Attributes:
@@ -127,8 +122,7 @@ class Posterior:
     compensation: jax.Array
 
 
-@struct.dataclass
-class Episode:
+class Episode(struct.PyTreeNode):
     """The real episode that is running.
 
     Attributes:
@@ -147,8 +141,7 @@ class Episode:
     length: jax.Array
 
 
-@struct.dataclass
-class EpisodeEnd:
+class EpisodeEnd(struct.PyTreeNode):
     """One real step's news for `episodes.jsonl`: meaningful where `done`. Every leaf [] but probs [N·M]."""
 
     done: jax.Array
@@ -168,16 +161,14 @@ class EpisodeEnd:
         return cls(flag, count, count, flag, flag, number, count, probs)
 
 
-@struct.dataclass
-class Moments:
+class Moments(struct.PyTreeNode):
     """Running mean and sum of squared deviations of (observation, action) over D_E, [O + A] each (Welford)."""
 
     mean: jax.Array
     deviation: jax.Array
 
 
-@struct.dataclass
-class SeedState:
+class SeedState(struct.PyTreeNode):
     """Everything one seed owns. In a train state every leaf has a leading [S]; models, agents and imagined data
     have their member axis next and are spread over the mesh along it.
 
@@ -217,8 +208,7 @@ class Counters(NamedTuple):
     imagined_rows: jax.Array
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """A run between two chunks.
 
     Attributes:

@@ -82,9 +82,7 @@ class HostEnv:
             expected = (self.num_envs, self.spec.action_size)
             raise ValueError(f"actions must have shape {expected}, not {np.shape(actions)}")
         actions = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
-        results = [
-            simulator.step(action) for simulator, action in zip(self._simulators, actions, strict=True)
-        ]
+        results = [simulator.step(action) for simulator, action in zip(self._simulators, actions, strict=True)]
         next_obs, reward, terminated = (np.asarray(column) for column in zip(*results, strict=True))
         next_obs = next_obs.astype(np.float32)
         self._lengths += 1

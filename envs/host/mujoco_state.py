@@ -45,7 +45,5 @@ class MujocoState:
         self._action = None if saved["action"] is None else np.array(saved["action"])
         mujoco.mj_setState(self._model, self._data, self._before, _STATE)
         mujoco.mj_forward(self._model, self._data)
-        mujoco.mj_setState(
-            self._model, self._data, self._before, _STATE
-        )  # forward moved the solver's warm start
+        mujoco.mj_setState(self._model, self._data, self._before, _STATE)  # forward moved the solver's warm start
         return self._action

@@ -14,8 +14,7 @@ from vecpsmbpo.envs.mjx import integrator
 from vecpsmbpo.types import EnvSpec
 
 
-@struct.dataclass
-class Physics:
+class Physics(struct.PyTreeNode):
     """All that the simulator needs to go on: what lies between two control steps.
 
     The rest of `mjx.Data` is a function of it, and is recomputed by the step. This keeps the state of an environment
@@ -77,7 +76,7 @@ class MjxEnv(Env):
         """The state at a simulator state: qpos [nq], qvel [nv], with a cold solver."""
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         physics = Physics(qpos, qvel, warmstart=jnp.zeros_like(qvel))
-        return State(physics, self.observe(physics), reward=jnp.zeros(()), done=jnp.zeros(()))  # type: ignore[arg-type]
+        return State(physics, self.observe(physics), reward=jnp.zeros(()), done=jnp.zeros(()))
 
     def step(self, state: State, action: jax.Array) -> State:
         before: Any = state.pipeline_state
@@ -85,7 +84,7 @@ class MjxEnv(Env):
         # TF32 matrix products hurt physics on GPUs.
         with jax.default_matmul_precision("highest"):
             after = self._advance(before, self.control(action))
-            return state.replace(  # type: ignore[attr-defined]
+            return state.replace(
                 pipeline_state=after,
                 obs=self.observe(after),
                 reward=self.reward(before, action, after),

@@ -31,9 +31,7 @@ def runge_kutta(model: Any, data: Any) -> Any:
     def stage(carry, tableau):
         velocity, acceleration, velocity_sum, acceleration_sum = carry
         offset, weight = tableau
-        here = data.replace(
-            qpos=data.qpos + step * offset * velocity, qvel=data.qvel + step * offset * acceleration
-        )
+        here = data.replace(qpos=data.qpos + step * offset * velocity, qvel=data.qvel + step * offset * acceleration)
         qacc = mjx.forward(model, here).qacc
         velocity_sum = velocity_sum + weight * here.qvel
         return (here.qvel, qacc, velocity_sum, acceleration_sum + weight * qacc), None

@@ -47,9 +47,7 @@ class PsMbpo:
         return SeedState(
             key=key,
             hyper=hyper,
-            models=jax.vmap(lambda k: dynamics.init(k, settings, spec))(
-                layout.keys(model_key, layout.model_ids())
-            ),
+            models=jax.vmap(lambda k: dynamics.init(k, settings, spec))(layout.keys(model_key, layout.model_ids())),
             agents=jax.vmap(lambda k: sac.init(k, nets, spec))(layout.keys(agent_key, layout.member_ids())),
             real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
@@ -72,7 +70,7 @@ class PsMbpo:
         action = self.layout.ask(
             state.episode.member,
             state.agents.actor,
-            lambda params: actor.apply(params, obs).sample(policy_key)[0],
+            lambda params: actor.law(params, obs).sample(policy_key)[0],
         )
         uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0, maxval=1.0)
         return jnp.where(state.episode.random, uniform, action)
@@ -91,9 +89,9 @@ class PsMbpo:
         """Mean action of the evaluation policy; for `average`, averaged over the members. obs [O] -> [A]."""
         actor = sac.make_networks(self.settings, self.spec).actor
         if self.settings.eval_policy == "average":
-            actions = jax.vmap(lambda params: actor.apply(params, obs).mode())(policy)
+            actions = jax.vmap(lambda params: actor.law(params, obs).mode())(policy)
             return self.layout.mean_over_members(actions)
-        return actor.apply(policy, obs).mode()
+        return actor.law(policy, obs).mode()
 
     # ── observe ──────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -155,9 +153,7 @@ class PsMbpo:
             epoch_episodes=cleared(state.epoch_episodes),
         )
 
-    def fit_models(
-        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
-    ) -> SeedState:
+    def fit_models(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Refits every model on D_E (Algorithm 1, line 2); zero epochs where not `enabled`."""
         settings, spec = self.settings, self.spec
         split_key, fit_key = jax.random.split(key)
@@ -245,9 +241,7 @@ class PsMbpo:
 
         return layout.map_local(update, state.agents, batches, layout.keys(update_key, ids))
 
-    def minibatches(
-        self, counters: Counters, state: SeedState, imagined: jax.Array, key: jax.Array
-    ) -> Transition:
+    def minibatches(self, counters: Counters, state: SeedState, imagined: jax.Array, key: jax.Array) -> Transition:
         """G minibatches, each row real with probability λ, on its own (footnote 2). imagined: [C_M, F]."""
         shape = (self.settings.updates_per_step, self.settings.policy_batch_size)
         source_key, real_key, imagined_key = jax.random.split(key, 3)
