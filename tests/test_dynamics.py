@@ -1,5 +1,7 @@
 """The fit of one model: the split, early stopping, and that it learns."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,7 +86,8 @@ def test_the_best_parameters_are_restored(linear, fit, key):
     split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
     hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(1.0))
     whitening = (model.input_mean, model.input_std)
-    after = dynamics.fit(model, rows, split, whitening, hyper, key, jnp.int32(20), settings=settings, spec=SPEC)
+    refit = jax.jit(partial(dynamics.fit, settings=settings, spec=SPEC))
+    after = refit(model, rows, split, whitening, hyper, key, jnp.int32(1000))
     jax.tree.map(np.testing.assert_array_equal, after.params, model.params)
     steps = jax.tree.leaves(after.optimizer)[0] - jax.tree.leaves(model.optimizer)[0]
     per_epoch = -(-CAPACITY // 5 * 4 // settings.model_batch_size)

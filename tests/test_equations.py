@@ -1,5 +1,7 @@
 """The paper's equations against values worked by hand, or by scipy."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +42,7 @@ def test_log_variance_is_clamped_softly(key):
 def test_prediction_adds_the_residual_to_the_state_and_whitens_its_inputs(key):
     """Equations 20 and 21: with zero weights the outputs are the biases, whatever the input."""
     settings, spec = tiny(), specs.get("hopper")
-    model = dynamics.init(key, settings, spec)
+    model = jax.jit(partial(dynamics.init, settings=settings, spec=spec))(key)
     params = jax.tree.map(jnp.zeros_like, model.params)
     size = spec.obs_size + 1
     bias = jnp.concatenate([jnp.arange(size, dtype=jnp.float32), jnp.full(size, -1e3)])
@@ -135,43 +137,45 @@ def test_target_value_by_hand():
     assert sac.target_value(jnp.array(1.0), jnp.array(1.0), **arguments) == pytest.approx(1.0)
 
 
-def test_critic_loss_by_hand(key):
-    """Equation 27 with constant networks: Q_1 = Q_2 = 0 against a target of r alone (γ = 0)."""
+@pytest.fixture(scope="module")
+def agent():
+    """A SAC agent for hopper, its networks, and its update as one compiled function."""
     spec, settings = specs.get("hopper"), tiny()
     nets = sac.make_networks(settings, spec)
-    agent = sac.init(key, nets, spec)
+    update = jax.jit(partial(sac.update, nets=nets))
+    return spec, nets, jax.jit(lambda key: sac.init(key, nets, spec))(jax.random.key(0)), update
+
+
+def test_critic_loss_by_hand(key, agent):
+    """Equation 27 with constant networks: Q_1 = Q_2 = 0 against a target of r alone (γ = 0)."""
+    spec, nets, agent, _ = agent
     zero = jax.tree.map(jnp.zeros_like, agent.critic)
     batch = _batch(spec, reward=jnp.array([1.0, 3.0]))
-    loss, q_mean = sac.critic_loss(zero, agent, batch, jnp.float32(0.0), key, nets=nets)
+    loss, q_mean = jax.jit(partial(sac.critic_loss, nets=nets))(zero, agent, batch, jnp.float32(0.0), key)
     assert loss == pytest.approx(0.5 * (1 + 9) / 2 * 2)  # two critics
     assert q_mean == 0
 
 
-def test_actor_loss_is_the_kl_divergence_up_to_a_constant(key):
+def test_actor_loss_is_the_kl_divergence_up_to_a_constant(key, agent):
     """Equations 25 and 28 at α = 1: with Q = 0 everywhere the loss is E[log π]."""
-    spec, settings = specs.get("hopper"), tiny()
-    nets = sac.make_networks(settings, spec)
-    agent = sac.init(key, nets, spec)
+    spec, nets, agent, _ = agent
     zero = jax.tree.map(jnp.zeros_like, agent.critic)
-    loss, log_prob = sac.actor_loss(agent.actor, zero, jnp.float32(1.0), _batch(spec).obs, key, nets=nets)
+    actor_loss = jax.jit(partial(sac.actor_loss, nets=nets))
+    loss, log_prob = actor_loss(agent.actor, zero, jnp.float32(1.0), _batch(spec).obs, key)
     assert loss == pytest.approx(float(log_prob))
 
 
-def test_temperature_moves_towards_the_target_entropy(key):
-    spec, settings = specs.get("hopper"), tiny()
-    nets = sac.make_networks(settings, spec)
-    agent = sac.init(key, nets, spec)
+def test_temperature_moves_towards_the_target_entropy(key, agent):
+    spec, _, agent, update = agent
     for target, rises in ((50.0, True), (-50.0, False)):
-        hyper = Hyper.of(settings).replace(target_entropy=jnp.float32(target))
-        after = sac.update(agent, _batch(spec), hyper, key, nets=nets)
+        hyper = Hyper.of(tiny()).replace(target_entropy=jnp.float32(target))
+        after = update(agent, _batch(spec), hyper, key)
         assert (after.log_alpha > agent.log_alpha) == rises
 
 
-def test_target_critic_is_a_running_average(key):
-    spec, settings = specs.get("hopper"), tiny()
-    nets = sac.make_networks(settings, spec)
-    agent = sac.init(key, nets, spec)
-    after = sac.update(agent, _batch(spec), Hyper.of(settings), key, nets=nets)
+def test_target_critic_is_a_running_average(key, agent):
+    spec, _, agent, update = agent
+    after = update(agent, _batch(spec), Hyper.of(tiny()), key)
     expected = jax.tree.map(lambda old, new: 0.995 * old + 0.005 * new, agent.target_critic, after.critic)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), after.target_critic, expected)
 
