@@ -135,25 +135,28 @@ def test_inputs_are_whitened_by_all_the_data(trained):
     np.testing.assert_allclose(moments.deviation / STEPS, inputs.var(0), atol=1e-4)
 
 
-def test_an_epoch_compiles_once_whatever_the_data_size():
-    settings = settings_for(updates_per_step=1)
-    driver = make_driver("scan", False, settings)
-    state = driver.init(*initial_inputs(settings))
-    for periods in (1, 2, 1, 3, 3):
-        state, _ = driver.run(state, periods)
-    assert driver._run._cache_size() == 1
-
-
-def test_chunks_of_any_length_give_the_same_run():
+def test_an_epoch_compiles_once_whatever_the_data_size_and_chunks_do_not_matter():
+    """Chunks of 1, 4, 2 and 3 periods: one compilation, and the same run as a chunk of 10."""
     settings = settings_for(updates_per_step=1)
     driver = make_driver("scan", True, settings)
-    ends = []
-    for chunks in ([10], [1, 4, 2, 3]):
-        state = driver.init(*initial_inputs(settings))
-        for periods in chunks:
+    whole, _ = driver.run(driver.init(*initial_inputs(settings)), 10)
+    state = driver.init(*initial_inputs(settings))
+    compiled: list[str] = []
+
+    def listen(event, duration, **kwargs):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for periods in (1, 4, 2, 3):
             state, _ = driver.run(state, periods)
-        ends.append(state.seeds.agents.actor)
-    jax.tree.map(np.testing.assert_array_equal, *ends)
+        assert not compiled
+        jax.jit(lambda x: x + len(compiled))(jnp.ones(3))
+        assert compiled  # the listener does hear compilations
+    finally:
+        jax.monitoring.clear_event_listeners()
+    jax.tree.map(np.testing.assert_array_equal, whole.seeds.agents.actor, state.seeds.agents.actor)
 
 
 def test_only_real_data_needs_no_models():

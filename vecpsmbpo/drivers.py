@@ -146,7 +146,7 @@ class ScanDriver:
 
     def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:
         state, log = (self._compiled or self._run)(state, jnp.int32(periods))
-        flat = jax.tree.map(lambda x: np.asarray(x[:periods]).reshape(-1, *x.shape[2:]), log)
+        flat = jax.tree.map(lambda x: np.asarray(x)[:periods].reshape(-1, *x.shape[2:]), log)
         return state, flat
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
