@@ -1,5 +1,6 @@
 """The command line. Imports JAX only once every argument has been understood."""
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -57,10 +58,15 @@ def _train(overrides: list[str]) -> int:
 
 
 def _run(settings) -> int:
-    from vecpsmbpo.train import Diverged, train
+    from vecpsmbpo.train import DiskError, Diverged, train
 
     try:
         return train(settings)
+    except DiskError as error:
+        print(f"vecpsmbpo: {error}", file=sys.stderr, flush=True)
+        # Not a plain exit: the writer threads of orbax and tensorboardX would each report the same disk again, in
+        # tracebacks of their own, while the interpreter ends.
+        os._exit(2)
     except Diverged as error:
         print(f"vecpsmbpo: {error}", file=sys.stderr)
         return 1
@@ -77,7 +83,7 @@ def _multirun(overrides: list[str]) -> int:
     def task(tree) -> None:
         from hydra.core.hydra_config import HydraConfig
 
-        status = _run(config.resolve(list(HydraConfig.get().overrides.task)))
+        status = _run(config.resolve(list(HydraConfig.get().overrides.task), tree))
         if status:
             sys.exit(status)
 

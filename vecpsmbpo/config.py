@@ -145,16 +145,24 @@ def load(run_dir: str | Path):
         raise SettingError(f"run_dir={run_dir}: its {CONFIG_FILE} cannot be read ({error})") from None
 
 
-def resolve(overrides: Sequence[str]):
+def resolve(overrides: Sequence[str], tree: DictConfig | None = None):
     """The settings of a run, new or resumed: a `run_dir` that holds one resumes with its own.
+
+    Args:
+        overrides: `name=value` each.
+        tree: what Hydra composed of them, where it already has (a job of a multirun).
 
     Raises:
         SettingError: a mistake in `overrides`, or one contradicts the stored run.
     """
     given = parse(overrides)
-    run_dir = given.get("run_dir") or compose(overrides).run_dir
+
+    def new():
+        return compose(overrides) if tree is None else from_tree(tree, overrides)
+
+    run_dir = given.get("run_dir") or new().run_dir
     if not (Path(run_dir) / CONFIG_FILE).exists():
-        return compose(overrides)
+        return new()
     stored = load(run_dir)
     changed = {}
     for name, value in given.items():

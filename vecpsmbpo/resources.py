@@ -1,5 +1,8 @@
 """The memory that a run will take, before any of it is taken, and the memory that there is."""
 
+import errno
+import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +12,10 @@ import numpy as np
 from vecpsmbpo import imagination, replay
 from vecpsmbpo.layout import MEMBERS, SEEDS, Layout
 from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.types import EnvSpec
+from vecpsmbpo.types import EnvSpec, TrainState
 
 GIB = 2**30
+CHECKPOINT_OVERHEAD = 2**20  # orbax's own files
 
 
 def state_bytes(layout: Layout, shapes: Any) -> int:
@@ -75,3 +79,23 @@ def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any)
             "replay_capacity, n_models, n_policies or num_seeds"
         )
     return f"{words}, of {free / GIB:.1f} GiB free"
+
+
+def check_disk(directory: Path, state: TrainState) -> None:
+    """Whether there is room for a checkpoint: parameters whole, buffers as far as they are filled.
+
+    Asked before writing, since orbax's threads report a disk that fills under them in a page of tracebacks.
+
+    Raises:
+        OSError: ENOSPC.
+    """
+
+    def filled(ring: jax.Array, added: jax.Array) -> int:
+        return ring.nbytes * min(int(added), ring.shape[-2]) // ring.shape[-2]
+
+    seeds, counters = state.seeds, state.counters
+    needed = CHECKPOINT_OVERHEAD + filled(seeds.real, counters.env_steps)
+    needed += filled(seeds.imagined, counters.imagined_rows)
+    needed += sum(leaf.nbytes for leaf in jax.tree.leaves((seeds.models, seeds.agents)))
+    if shutil.disk_usage(directory).free < needed:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -22,10 +22,14 @@ from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
 from vecpsmbpo.envs import specs
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.progress import Display, Stopwatch
-from vecpsmbpo.settings import SettingError, Settings
+from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Hyper, TrainState
 
 LONG_EPOCH_S = 20.0  # an epoch that takes longer is run period by period, to show progress and to heed signals
+
+
+class DiskError(Exception):
+    """The run directory cannot be written; the last checkpoint is whole."""
 
 
 class Diverged(Exception):
@@ -63,7 +67,8 @@ def train(settings: Settings) -> int:
         0, or 128 + the number of the signal that stopped it.
 
     Raises:
-        SettingError: it cannot be run as asked.
+        SettingError: it cannot be run as asked (`resources.check_memory`, `envs.make`).
+        DiskError: the run directory cannot be written.
         Diverged: something became NaN or infinite.
     """
     runtime.configure(settings)
@@ -188,6 +193,7 @@ class _Run:
 
     def _save(self) -> None:
         if self.saved_step != self.env_steps:
+            resources.check_disk(self.run_dir, self.state)
             host = {"env": self.driver.save_env(), "seconds": self.watch()}
             self.checkpoints.save(self.env_steps, self.state, host, self.driver.layout)
             self.saved_step = self.env_steps
@@ -263,11 +269,14 @@ def _disk_errors(run_dir: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise SettingError(f"run_dir={run_dir}: cannot be written ({os.strerror(error.errno or errno.EIO)})") from error
+        reason = os.strerror(error.errno or errno.EIO)
     except ValueError as error:  # orbax's storage layer reports a full disk so
         if "No space left" not in str(error) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        raise SettingError(f"run_dir={run_dir}: cannot be written (No space left on device)") from error
+        reason = os.strerror(errno.ENOSPC)
+    else:
+        return
+    raise DiskError(f"run_dir={run_dir}: cannot be written ({reason})")
 
 
 def _warn(text: str) -> None:
