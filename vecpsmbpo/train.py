@@ -2,7 +2,6 @@
 
 import dataclasses
 import errno
-import logging
 import os
 import signal
 import sys
@@ -90,7 +89,7 @@ class _Run:
         self.settings, self.driver = settings, driver
         self.run_dir = Path(settings.run_dir)
         self.checkpoints = checkpoint.Checkpoints(self.run_dir / "checkpoints")
-        saved = self.checkpoints.restore(shapes, driver.layout, warn=lambda text: _warn(text))
+        saved = self.checkpoints.restore(shapes, driver.layout, warn=_warn)
         self.state = saved.state if saved else driver.init(*initial_inputs(settings))
         self.saved_step = saved.step if saved else None
         self.watch = Stopwatch(saved.host["seconds"] if saved else 0.0)
@@ -211,7 +210,7 @@ class _Run:
         for kind, tree in (("agents", seeds.agents), ("models", seeds.models)):
             if bool(_all_finite(tree)):
                 continue
-            what, seed, index = _first_not_finite(tree, self.driver.layout, kind)
+            what, seed, index = _first_not_finite(tree, kind)
             member = (
                 f"model n = {index}"
                 if kind == "models"
@@ -229,7 +228,7 @@ def _all_finite(tree: Any) -> jax.Array:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
-def _first_not_finite(tree: Any, layout: Layout, kind: str) -> tuple[str, int, int]:
+def _first_not_finite(tree: Any, kind: str) -> tuple[str, int, int]:
     """Name of the leaf, seed and member (or model) of the first entry that is not finite."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         bad = ~np.isfinite(np.asarray(leaf)).reshape(*leaf.shape[:2], -1).all(axis=-1)
@@ -281,4 +280,3 @@ def _disk_errors(run_dir: Path) -> Iterator[None]:
 
 def _warn(text: str) -> None:
     print(f"vecpsmbpo: warning: {text}", file=sys.stderr, flush=True)
-    logging.getLogger(__name__).debug(text)
