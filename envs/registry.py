@@ -36,12 +36,16 @@ class Task:
 
 
 TASKS = {
+    "ant": Task(27, 8, 1000, "gymnasium", "ant:Ant", "gymnasium:ant"),
     "ball_in_cup": Task(8, 2, 1000, "dm_control", "ball_in_cup:BallInCup", "dm_control:ball_in_cup"),
     "cartpole_swingup": Task(5, 1, 1000, "dm_control", "cartpole:CartpoleSwingup", "dm_control:cartpole_swingup"),
     "cartpole_swingup_sparse": Task(
         5, 1, 1000, "dm_control", "cartpole:CartpoleSwingupSparse", "dm_control:cartpole_swingup_sparse"
     ),
+    "halfcheetah": Task(17, 6, 1000, "gymnasium", "halfcheetah:HalfCheetah", "gymnasium:halfcheetah"),
     "hopper": Task(11, 3, 1000, "gymnasium", "hopper:Hopper", "gymnasium:hopper"),
+    "walker2d": Task(17, 6, 1000, "gymnasium", "walker2d:Walker2d", "gymnasium:walker2d"),
+    "window_open": Task(39, 4, 250, "metaworld", None, "metaworld:window_open"),
 }
 
 

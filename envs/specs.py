@@ -7,6 +7,8 @@ from vecpsmbpo.envs.registry import TASKS
 from vecpsmbpo.types import EnvSpec
 
 HOPPER_STATE_LIMIT, HOPPER_MIN_HEIGHT, HOPPER_MAX_ANGLE = 100.0, 0.7, 0.2
+WALKER_MIN_HEIGHT, WALKER_MAX_HEIGHT, WALKER_MAX_ANGLE = 0.8, 2.0, 1.0
+ANT_MIN_HEIGHT, ANT_MAX_HEIGHT = 0.2, 1.0
 
 
 def never(obs: jax.Array, action: jax.Array, next_obs: jax.Array) -> jax.Array:
@@ -28,7 +30,19 @@ def hopper_falls(obs: jax.Array, action: jax.Array, next_obs: jax.Array) -> jax.
     return ~healthy
 
 
-_TERMINATION = {"hopper": hopper_falls}
+def walker_falls(obs: jax.Array, action: jax.Array, next_obs: jax.Array) -> jax.Array:
+    """Walker2d-v4's rule on obs = (z, angle, ...)."""
+    z, angle = next_obs[..., 0], next_obs[..., 1]
+    return ~((z > WALKER_MIN_HEIGHT) & (z < WALKER_MAX_HEIGHT) & (jnp.abs(angle) < WALKER_MAX_ANGLE))
+
+
+def ant_leaves_its_height(obs: jax.Array, action: jax.Array, next_obs: jax.Array) -> jax.Array:
+    """Ant-v4's rule on obs = (z, ...): not finite, or z outside [0.2, 1]."""
+    z = next_obs[..., 0]
+    return ~(jnp.all(jnp.isfinite(next_obs), axis=-1) & (z >= ANT_MIN_HEIGHT) & (z <= ANT_MAX_HEIGHT))
+
+
+_TERMINATION = {"ant": ant_leaves_its_height, "hopper": hopper_falls, "walker2d": walker_falls}
 
 
 def get(name: str) -> EnvSpec:

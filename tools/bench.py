@@ -3,8 +3,9 @@
     python tools/bench.py updates     SAC updates inside the real program, against the float32 matrix-product peak
     python tools/bench.py capacity    cost of a step at a large and at a small replay capacity
     python tools/bench.py program     cost of a step of the whole program, against its SAC updates alone
+    python tools/bench.py envs        steps per second and compile seconds of every task, on each backend and batch size
 
-Further arguments are settings, as for `vecpsmbpo train`. One line of JSON per measurement.
+Further arguments are settings, as for `vecpsmbpo train` (of `envs`: tasks). One line of JSON per measurement.
 """
 
 import json
@@ -17,8 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import config, runtime
+from vecpsmbpo import config, envs, runtime
 from vecpsmbpo.drivers import ScanDriver, over_seeds
+from vecpsmbpo.envs.registry import TASKS
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.train import initial_inputs, make_driver
 from vecpsmbpo.types import TrainState
@@ -163,10 +165,58 @@ def bench_program() -> dict[str, Any]:
     return {"ms_per_step": 1e3 * whole, "ms_of_updates_alone": 1e3 * alone, "ratio": whole / alone}
 
 
-BENCHES = {"updates": bench_updates, "capacity": bench_capacity, "program": bench_program}
+def bench_envs() -> list[dict[str, Any]]:
+    """Every task (or those named) on every backend that it has; actions are uniform."""
+    found = []
+    for name in sys.argv[2:] or TASKS:
+        for backend in TASKS[name].backends:
+            for batch in (1, 10, 100):
+                measure = mjx_steps if backend == "mjx" else host_steps
+                found.append({"env": name, "backend": backend, "batch": batch, **measure(name, batch)})
+                print(found[-1], file=sys.stderr, flush=True)
+    return found
+
+
+def mjx_steps(name: str, batch: int) -> dict[str, float]:
+    env, steps = envs.make(name, "mjx"), 50
+
+    def step(state, key):
+        action = jax.random.uniform(key, (batch, env.action_size), minval=-1.0, maxval=1.0)
+        return jax.vmap(env.step)(state, action), None
+
+    @jax.jit
+    def run(state, key):
+        return jax.lax.scan(step, state, jax.random.split(key, steps))[0]
+
+    key = jax.random.key(0)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, batch))
+    began = time.perf_counter()
+    compiled = run.lower(state, key).compile()
+    compile_seconds = time.perf_counter() - began
+    state = compiled(state, key)  # past the start, where nothing touches yet
+    return {
+        "steps_per_s": batch * steps / best_seconds(lambda: compiled(state, key), 3),
+        "compile_seconds": compile_seconds,
+    }
+
+
+def host_steps(name: str, batch: int) -> dict[str, float]:
+    env, steps, random = envs.make(name, "host", num_envs=batch), 50, np.random.default_rng(0)
+    env.reset()
+
+    def run():
+        for _ in range(steps):
+            env.step(random.uniform(-1, 1, (batch, env.spec.action_size)))
+
+    return {"steps_per_s": batch * steps / best_seconds(run, 3)}
+
+
+BENCHES = {"envs": bench_envs, "updates": bench_updates, "capacity": bench_capacity, "program": bench_program}
 
 if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in BENCHES:
         sys.exit(f"usage: bench.py {'|'.join(BENCHES)} [setting=value ...]")
-    result = BENCHES[sys.argv[1]]()
-    print(json.dumps({"bench": sys.argv[1], "devices": jax.device_count(), "backend": jax.default_backend(), **result}))
+    results = BENCHES[sys.argv[1]]()
+    machine = {"bench": sys.argv[1], "devices": jax.device_count(), "platform": jax.default_backend()}
+    for result in results if isinstance(results, list) else [results]:
+        print(json.dumps({**machine, **result}))

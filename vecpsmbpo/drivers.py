@@ -5,6 +5,7 @@ begins with a refresh (models refitted, imagination renewed); then every step ac
 whole number of periods, decided when the program is called: one compiled program serves chunks of any length.
 """
 
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,8 @@ from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.layout import SEEDS, Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
+
+COMPILER_STACK = 64 * 2**20  # bytes
 
 _SHARED, _BY_SEED = PartitionSpec(), PartitionSpec(SEEDS)
 _LOG = PartitionSpec(None, None, SEEDS)
@@ -140,8 +143,12 @@ class ScanDriver:
         began = time.perf_counter()
         keys = jax.eval_shape(lambda key: _split(key, self.settings.eval_episodes), state.seeds.key)
         lowered = (self._run.lower(state, jnp.int32(1)), self._evaluate.lower(state.seeds, keys))
-        with ThreadPoolExecutor() as pool:  # XLA compiles outside of Python's lock: together they cost the longer one
+        # XLA compiles outside of Python's lock: together they cost the longer one. It recurses deeper than a thread's
+        # usual stack allows (jax 0.11.2 crashes).
+        usual = threading.stack_size(COMPILER_STACK)
+        with ThreadPoolExecutor() as pool:
             self._compiled, self._compiled_evaluate = pool.map(lambda program: program.compile(), lowered)
+        threading.stack_size(usual)
         self.compile_seconds = time.perf_counter() - began
 
     def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:

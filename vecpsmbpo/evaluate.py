@@ -1,12 +1,15 @@
 """`vecpsmbpo eval`: whole episodes of a trained run's policies."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from vecpsmbpo import checkpoint, runtime
+from vecpsmbpo import checkpoint, config, runtime, sac
+from vecpsmbpo.drivers import Driver
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.train import evaluation_keys, initial_inputs, make_driver
 
@@ -22,14 +25,7 @@ def evaluate(stored: Settings, settings: Settings) -> int:
         SettingError: the run holds no checkpoint.
     """
     runtime.configure(settings)
-    trained = make_driver(stored)
-    shapes = jax.eval_shape(trained.init, *initial_inputs(stored))
-    checkpoints = checkpoint.Checkpoints(Path(stored.run_dir) / "checkpoints")
-    saved = checkpoints.restore(shapes, trained.layout, warn=lambda text: Console(stderr=True).print(text))
-    checkpoints.close()
-    if saved is None:
-        raise SettingError(f"run_dir={stored.run_dir}: holds no checkpoint yet")
-
+    trained, saved = restore(stored)
     driver = trained if settings == stored else make_driver(settings)
     returns = driver.evaluate(saved.state, evaluation_keys(settings, saved.step), settings.eval_episodes)
     table = Table(title=f"{settings.env} ({settings.backend}) at step {saved.step}, policy: {settings.eval_policy}")
@@ -41,3 +37,37 @@ def evaluate(stored: Settings, settings: Settings) -> int:
         table.add_row(str(settings.seed + index), str(values.size), *(f"{value:.1f}" for value in row))
     Console(highlight=False).print(table)
     return 0
+
+
+def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
+    """The driver of a run and its newest checkpoint.
+
+    Raises:
+        SettingError: the run holds no checkpoint.
+    """
+    driver = make_driver(stored)
+    shapes = jax.eval_shape(driver.init, *initial_inputs(stored))
+    checkpoints = checkpoint.Checkpoints(Path(stored.run_dir) / "checkpoints")
+    saved = checkpoints.restore(shapes, driver.layout, warn=lambda text: Console(stderr=True).print(text))
+    checkpoints.close()
+    if saved is None:
+        raise SettingError(f"run_dir={stored.run_dir}: holds no checkpoint yet")
+    return driver, saved
+
+
+def load_policy(run_dir: str | Path) -> tuple[Settings, Callable[[jax.Array], jax.Array]]:
+    """A trained policy, to be used outside of this program: the member of the first seed that has earned the most.
+
+    Returns:
+        The run's settings, and its mean action as a jitted function: obs [..., O] -> action [..., A] in [-1, 1].
+
+    Raises:
+        SettingError: there is no run in `run_dir`, or it holds no checkpoint.
+    """
+    settings = config.load(run_dir)
+    driver, saved = restore(settings)
+    seeds = driver.layout.unpad(saved.state).seeds
+    member = jnp.argmax(seeds.posterior.returns[0])
+    params = jax.tree.map(lambda x: x[0, member], seeds.agents.actor)
+    actor = sac.make_networks(settings, driver.algorithm.spec).actor
+    return settings, jax.jit(lambda obs: actor.law(params, obs).mode())

@@ -45,7 +45,25 @@ class GymnasiumSimulator(Simulator):
         self.env.np_random.bit_generator.state = saved["generator"]
 
 
+def _batched(name: str, env_id: str, num_envs: int, seed: int) -> HostEnv:
+    return HostEnv(specs.get(name), [GymnasiumSimulator(env_id, seed + index) for index in range(num_envs)])
+
+
+def ant(*, num_envs: int, seed: int) -> HostEnv:
+    """Ant-v4."""
+    return _batched("ant", "Ant-v4", num_envs, seed)
+
+
+def halfcheetah(*, num_envs: int, seed: int) -> HostEnv:
+    """HalfCheetah-v4."""
+    return _batched("halfcheetah", "HalfCheetah-v4", num_envs, seed)
+
+
 def hopper(*, num_envs: int, seed: int) -> HostEnv:
     """Hopper-v4."""
-    simulators = [GymnasiumSimulator("Hopper-v4", seed + index) for index in range(num_envs)]
-    return HostEnv(specs.get("hopper"), simulators)
+    return _batched("hopper", "Hopper-v4", num_envs, seed)
+
+
+def walker2d(*, num_envs: int, seed: int) -> HostEnv:
+    """Walker2d-v4."""
+    return _batched("walker2d", "Walker2d-v4", num_envs, seed)

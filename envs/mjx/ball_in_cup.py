@@ -7,7 +7,8 @@ import numpy as np
 from dm_control.suite import ball_in_cup
 
 from vecpsmbpo.envs import specs
-from vecpsmbpo.envs.mjx.base import MjxEnv, Physics
+from vecpsmbpo.envs.mjx.base import MjxEnv
+from vecpsmbpo.envs.mjx.simulator import Physics
 
 CONTROL_TIMESTEP = 0.02
 RESET_X, RESET_Z = (-0.2, 0.2), (0.2, 0.5)

@@ -7,25 +7,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from brax.envs.base import Env, State
-from flax import struct
-from mujoco import mjx
 
-from vecpsmbpo.envs.mjx import integrator
+from vecpsmbpo.envs.mjx.simulator import Physics, Simulator
 from vecpsmbpo.types import EnvSpec
-
-
-class Physics(struct.PyTreeNode):
-    """All that the simulator needs to go on: what lies between two control steps.
-
-    The rest of `mjx.Data` is a function of it, and is recomputed by the step. This keeps the state of an environment
-    to a few dozen floats: a reset inside a scan is a cheap select, and a checkpoint does not depend on MJX's layout.
-
-    Shapes: qpos [nq], qvel [nv], warmstart [nv] (the solver's starting point, `qacc_warmstart`).
-    """
-
-    qpos: jax.Array
-    qvel: jax.Array
-    warmstart: jax.Array
 
 
 class MjxEnv(Env):
@@ -45,9 +29,7 @@ class MjxEnv(Env):
         """
         self.model = model
         self.substeps = substeps
-        self._mjx_model = mjx.put_model(model, impl="jax")
-        self._blank = mjx.make_data(model, impl="jax")
-        self._step = integrator.runge_kutta if integrator.loops_over_stages(model) else mjx.step
+        self._simulator = Simulator(model)
 
     # what a task defines
 
@@ -75,7 +57,7 @@ class MjxEnv(Env):
     def state_at(self, qpos: jax.Array, qvel: jax.Array) -> State:
         """The state at a simulator state: qpos [nq], qvel [nv], with a cold solver."""
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
-        physics = Physics(qpos, qvel, warmstart=jnp.zeros_like(qvel))
+        physics = self._simulator.at_rest(qpos, qvel)
         return State(physics, self.observe(physics), reward=jnp.zeros(()), done=jnp.zeros(()))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -98,11 +80,7 @@ class MjxEnv(Env):
 
     def _advance(self, physics: Physics, control: jax.Array) -> Physics:
         def substep(_, physics: Physics) -> Physics:
-            data = self._blank.replace(
-                qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.warmstart, ctrl=control
-            )
-            data = self._step(self._mjx_model, data)
-            return Physics(data.qpos, data.qvel, data.qacc_warmstart)
+            return self._simulator.step(physics, control)
 
         if self.substeps == 1:
             return substep(0, physics)

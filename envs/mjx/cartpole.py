@@ -6,7 +6,8 @@ import mujoco
 from dm_control.suite import cartpole
 
 from vecpsmbpo.envs import specs
-from vecpsmbpo.envs.mjx.base import MjxEnv, Physics
+from vecpsmbpo.envs.mjx.base import MjxEnv
+from vecpsmbpo.envs.mjx.simulator import Physics
 from vecpsmbpo.envs.mjx.tolerance import tolerance
 
 CART_RANGE = (-0.25, 0.25)

@@ -1,0 +1,218 @@
+"""Compares every MJX port with its original simulator, as a table and as CSV.
+
+    python tools/parity.py [task ...] [states=2000] [episodes=30] [run_dir=RUN ...] > results/parity.csv
+
+For each task:
+    step        one control step from the same simulator state and action: errors of observation and reward, and
+                agreement of `terminated`; states from random policies (fresh every step, and held for ten) and, where a
+                run directory of the task is given, from its trained policy
+    reset       the smallest p-value of two-sample Kolmogorov–Smirnov tests over the coordinates of initial states
+    episodes    length and return of whole random-policy episodes on both backends, mean and standard error
+"""
+
+import csv
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import scipy.stats
+from rich.console import Console
+from rich.table import Table
+
+from vecpsmbpo import envs
+from vecpsmbpo.envs.mjx.simulator import Physics
+from vecpsmbpo.envs.registry import TASKS
+
+PORTED = [name for name, task in TASKS.items() if task.mjx]
+NEAR = 1e-4  # a state this close to a termination threshold may fall on either side in float32
+
+
+@dataclass
+class Step:
+    """Original states and what one control step makes of them; T rows each."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    warmstart: np.ndarray
+    seen: np.ndarray
+    contacts: np.ndarray
+    action: np.ndarray
+    next_obs: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+
+
+def simulator_data(host: Any) -> Any:
+    """`mjData` of the first simulator of a host environment."""
+    env = host._simulators[0].env
+    return env.physics.data if hasattr(env, "physics") else env.unwrapped.data
+
+
+def uniform(held: int, action_size: int, seed: int):
+    """A policy of uniform actions, each held for `held` steps."""
+    random, state = np.random.default_rng(seed), {"t": 0, "action": np.zeros(action_size)}
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        if state["t"] % held == 0:
+            state["action"] = random.uniform(-1, 1, action_size)
+        state["t"] += 1
+        return state["action"]
+
+    return act
+
+
+def collect(name: str, act: Any, states: int, seed: int) -> Step:
+    """Steps the original with the policy `act`: obs [O] -> action [A]."""
+    host = envs.make(name, "host", seed=seed)
+    obs, rows = host.reset()[0], []
+    for _ in range(states):
+        data = simulator_data(host)
+        seen = np.array(data.qpos)
+        if data.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
+            seen[:3] = data.xpos[data.model.jnt_bodyid[0]]
+        action = act(obs)
+        before = [np.array(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)]
+        step = host.step(action[None])
+        contacts = simulator_data(host).ncon
+        rows.append((*before, seen, contacts, action, step.next_obs[0], step.reward[0], step.terminated[0]))
+        obs = step.obs[0]
+    return Step(*map(np.array, zip(*rows, strict=True)))
+
+
+class Port:
+    """An MJX port with its functions compiled once, over a batch of any one size."""
+
+    def __init__(self, name: str):
+        self.env = envs.make(name, "mjx")
+
+        def one(physics, action):
+            state = self.env.state_at(physics.qpos, physics.qvel).replace(pipeline_state=physics)
+            state = self.env.step(state, action)
+            return state.obs, state.reward, state.done
+
+        self.step = jax.jit(jax.vmap(one))
+        self.reset = jax.jit(jax.vmap(self.env.reset))
+
+    def repeat(self, steps: Step) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """obs [T, O], reward [T], terminated [T] bool of the same steps."""
+        numbers = (jnp.asarray(x, jnp.float32) for x in (steps.qpos, steps.qvel, steps.warmstart, steps.seen))
+        obs, reward, done = map(np.asarray, self.step(Physics(*numbers), jnp.asarray(steps.action, jnp.float32)))
+        return obs, reward, done.astype(bool)
+
+
+def near_threshold(env: Any, obs: np.ndarray) -> np.ndarray:
+    """[T] bool: a shift of 1e-4 of any one coordinate would change `terminated`."""
+    shifts = NEAR * np.concatenate([np.eye(obs.shape[1]), -np.eye(obs.shape[1])])
+    shifted = jnp.asarray(obs[:, None] + shifts, jnp.float32)
+    verdicts = np.asarray(env.spec.terminated(shifted, None, shifted))
+    return verdicts.any(axis=1) != verdicts.all(axis=1)
+
+
+def compare_steps(port: Port, steps: Step) -> dict[str, float]:
+    """The errors of the port on the original's steps."""
+    obs, reward, terminated = port.repeat(steps)
+    scale = np.maximum(1.0, np.abs(steps.next_obs).max(axis=1))
+    error = np.abs(obs - steps.next_obs).max(axis=1) / scale
+    reward_error = np.abs(reward - steps.reward) / np.maximum(1.0, np.abs(steps.reward))
+    clear = ~near_threshold(port.env, steps.next_obs)
+    return {
+        "states": len(error),
+        "in_contact": float(np.mean(steps.contacts > 0)),
+        "terminations": int(steps.terminated.sum()),
+        "near_threshold": int((~clear).sum()),
+        "obs_p50": float(np.median(error)),
+        "obs_p99": float(np.quantile(error, 0.99)),
+        "obs_max": float(error.max()),
+        "reward_p99": float(np.quantile(reward_error, 0.99)),
+        "reward_max": float(reward_error.max()),
+        "terminated_agree": float(np.mean(terminated[clear] == steps.terminated[clear])),
+    }
+
+
+def compare_resets(port: Port, name: str, count: int) -> float:
+    """The smallest p-value over coordinates; exact agreement of coordinates that do not vary counts as 1."""
+    ours = np.asarray(port.reset(jax.random.split(jax.random.key(0), count)).obs)
+    host = envs.make(name, "host", seed=1)
+    theirs = np.concatenate([host.reset() for _ in range(count)])
+    smallest = 1.0
+    for column in range(ours.shape[1]):
+        if np.ptp(theirs[:, column]) > 0:
+            smallest = min(smallest, scipy.stats.ks_2samp(ours[:, column], theirs[:, column]).pvalue)
+        elif not np.allclose(ours[:, column], theirs[:, column], atol=1e-6):
+            return 0.0
+    return float(smallest)
+
+
+def random_episodes(port: Port, name: str, count: int) -> dict[str, float]:
+    """Whole episodes of uniform actions on both backends: means and standard errors of return and length."""
+    env, limit = port.env, port.env.spec.episode_length
+
+    def step(carry, key):
+        state, alive, total, length = carry
+        action = jax.random.uniform(key, (count, env.action_size), minval=-1.0, maxval=1.0)
+        state = jax.vmap(env.step)(state, action)
+        total, length = total + jnp.where(alive, state.reward, 0.0), length + alive
+        return (state, alive & (state.done == 0), total, length), None
+
+    @jax.jit
+    def episodes(key):
+        state = jax.vmap(env.reset)(jax.random.split(key, count))
+        start = (state, jnp.ones(count, bool), jnp.zeros(count), jnp.zeros(count, jnp.int32))
+        _, _, total, length = jax.lax.scan(step, start, jax.random.split(key, limit))[0]
+        return total, length
+
+    ours = [np.asarray(x, float) for x in episodes(jax.random.key(2))]
+    host, random = envs.make(name, "host", num_envs=count, seed=5), np.random.default_rng(5)
+    host.reset()
+    total, length, alive = np.zeros(count), np.zeros(count), np.ones(count, bool)
+    while alive.any():
+        news = host.step(random.uniform(-1, 1, (count, env.action_size)))
+        total, length = total + np.where(alive, news.reward, 0.0), length + alive
+        alive &= ~(news.terminated | news.truncated)
+    found = {}
+    for backend, values in (("mjx", ours), ("host", (total, length))):
+        for what, value in zip(("return", "length"), values, strict=True):
+            found[f"{what}_{backend}"] = float(value.mean())
+            found[f"{what}_{backend}_se"] = float(value.std(ddof=1) / np.sqrt(count))
+    return found
+
+
+def trained_policy(run_dir: str):
+    """The task of a run, and its best member's policy: obs [O] -> action [A]."""
+    from vecpsmbpo import evaluate
+
+    settings, policy = evaluate.load_policy(run_dir)
+    return settings.env, lambda obs: np.asarray(policy(obs))
+
+
+def main(arguments: list[str]) -> None:
+    options = dict(text.split("=", 1) for text in arguments if "=" in text and not text.startswith("run_dir="))
+    states, episodes = int(options.get("states", 2000)), int(options.get("episodes", 30))
+    trained = dict(trained_policy(text.split("=", 1)[1]) for text in arguments if text.startswith("run_dir="))
+    names = [text for text in arguments if "=" not in text] or PORTED
+    rows = []
+    for name in names:
+        port = Port(name)
+        policies = {"random": uniform(1, port.env.action_size, 0), "held": uniform(10, port.env.action_size, 1)}
+        if name in trained:
+            policies["trained"] = trained[name]
+        whole = {"reset_p": compare_resets(port, name, 1000), **random_episodes(port, name, episodes)}
+        for policy, act in policies.items():
+            steps = collect(name, act, states, seed=len(rows))
+            rows.append({"task": name, "policy": policy, **compare_steps(port, steps), **whole})
+            print(f"{name} {policy}", file=sys.stderr, flush=True)
+    writer = csv.DictWriter(sys.stdout, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    table = Table(*(name for name in rows[0] if not name.endswith("_se")), title="MJX float32 against the original")
+    for row in rows:
+        table.add_row(*(f"{v:.2g}" if isinstance(v, float) else str(v) for k, v in row.items() if not k.endswith("_se")))
+    Console(stderr=True, width=200).print(table)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
