@@ -2,10 +2,18 @@
 
 import importlib
 import importlib.util
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 from vecpsmbpo.settings import SettingError
+
+
+class Sizes(NamedTuple):
+    """As in `EnvSpec`."""
+
+    obs_size: int
+    action_size: int
+    episode_length: int
 
 
 @dataclass(frozen=True)
@@ -13,39 +21,51 @@ class Task:
     """What `vecpsmbpo envs` lists of a task, and where its code is.
 
     Attributes:
-        obs_size, action_size, episode_length: as in `EnvSpec`.
         suite: the importable package that holds the original.
-        mjx: `module:class` of the MJX port below `vecpsmbpo.envs.mjx`, or None.
-        host: `module:function` of the host environment below `vecpsmbpo.envs.host`, or None.
+        code: by backend, `module:attribute` below `vecpsmbpo.envs.<backend>`: a class of MJX ports or a function that
+            makes one, and a function that makes a `HostEnv`. The backend that `auto` takes comes first.
+        sizes: of this task; None for a whole suite, whose tasks are named by `env.*` options.
+        extra: of this package, where the suite is not among its core dependencies.
     """
 
-    obs_size: int
-    action_size: int
-    episode_length: int
     suite: str
-    mjx: str | None
-    host: str | None
+    code: dict[str, str] = field(hash=False)
+    sizes: Sizes | None = None
+    extra: str | None = None
 
     @property
     def backends(self) -> tuple[str, ...]:
-        return tuple(name for name in ("mjx", "host") if getattr(self, name))
+        return tuple(self.code)
 
     @property
     def installed(self) -> bool:
         return importlib.util.find_spec(self.suite) is not None
 
 
+def _gymnasium(name: str, port: str, *sizes: int) -> Task:
+    return Task("gymnasium", {"mjx": f"{name}:{port}", "host": f"gymnasium:{name}"}, Sizes(*sizes))
+
+
+def _dm_control(name: str, port: str, *sizes: int) -> Task:
+    return Task("dm_control", {"mjx": port, "host": f"dm_control:{name}"}, Sizes(*sizes))
+
+
 TASKS = {
-    "ant": Task(27, 8, 1000, "gymnasium", "ant:Ant", "gymnasium:ant"),
-    "ball_in_cup": Task(8, 2, 1000, "dm_control", "ball_in_cup:BallInCup", "dm_control:ball_in_cup"),
-    "cartpole_swingup": Task(5, 1, 1000, "dm_control", "cartpole:CartpoleSwingup", "dm_control:cartpole_swingup"),
-    "cartpole_swingup_sparse": Task(
-        5, 1, 1000, "dm_control", "cartpole:CartpoleSwingupSparse", "dm_control:cartpole_swingup_sparse"
-    ),
-    "halfcheetah": Task(17, 6, 1000, "gymnasium", "halfcheetah:HalfCheetah", "gymnasium:halfcheetah"),
-    "hopper": Task(11, 3, 1000, "gymnasium", "hopper:Hopper", "gymnasium:hopper"),
-    "walker2d": Task(17, 6, 1000, "gymnasium", "walker2d:Walker2d", "gymnasium:walker2d"),
-    "window_open": Task(39, 4, 250, "metaworld", None, "metaworld:window_open"),
+    "ant": _gymnasium("ant", "Ant", 27, 8, 1000),
+    "ball_in_cup": _dm_control("ball_in_cup", "ball_in_cup:BallInCup", 8, 2, 1000),
+    "cartpole_swingup": _dm_control("cartpole_swingup", "cartpole:CartpoleSwingup", 5, 1, 1000),
+    "cartpole_swingup_sparse": _dm_control("cartpole_swingup_sparse", "cartpole:CartpoleSwingupSparse", 5, 1, 1000),
+    "halfcheetah": _gymnasium("halfcheetah", "HalfCheetah", 17, 6, 1000),
+    "hopper": _gymnasium("hopper", "Hopper", 11, 3, 1000),
+    "walker2d": _gymnasium("walker2d", "Walker2d", 17, 6, 1000),
+    "window_open": Task("metaworld", {"host": "metaworld:window_open"}, Sizes(39, 4, 250)),
+    # any task of a suite, and anybody's own
+    "gymnasium": Task("gymnasium", {"host": "gymnasium:any_task"}),
+    "dm_control": Task("dm_control", {"host": "dm_control:any_task"}),
+    "metaworld": Task("metaworld", {"host": "metaworld:any_task"}),
+    "playground": Task("mujoco_playground", {"mjx": "playground:any_task"}, extra="playground"),
+    "brax": Task("brax", {"mjx": "brax:any_task"}),
+    "custom": Task("vecpsmbpo", {"mjx": "custom:own_task", "host": "custom:own_task"}),
 }
 
 
@@ -65,19 +85,24 @@ def resolve_backend(name: str, backend: str = "auto") -> str:
     return backend
 
 
-def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0) -> Any:
+def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0, **options: Any) -> Any:
     """The task `name`.
 
     On `mjx`, one `brax.envs.base.Env` (batch it with `jax.vmap`; `num_envs` and `seed` are not used). On `host`, a
     `host.batched.HostEnv` of `num_envs` simulators, seeded seed, seed + 1, ….
 
+    Args:
+        options: which task of a suite, as `env.*` on the command line: `make("gymnasium", id="Swimmer-v5")`.
+
     Raises:
-        SettingError: no such task or backend, or its suite is not installed.
+        SettingError: no such task or backend, its suite is not installed, or it cannot be learned (images, discrete
+            actions).
     """
     backend = resolve_backend(name, backend)
     task = TASKS[name]
     if not task.installed:
-        raise SettingError(f"env={name}: needs the package {task.suite}; pip install {task.suite}")
-    module, attribute = (task.mjx if backend == "mjx" else task.host).split(":")  # type: ignore[union-attr]
+        package = f"'vecpsmbpo[{task.extra}]'" if task.extra else task.suite
+        raise SettingError(f"env={name}: needs the package {task.suite}; pip install {package}")
+    module, attribute = task.code[backend].split(":")
     found = getattr(importlib.import_module(f"vecpsmbpo.envs.{backend}.{module}"), attribute)
-    return found() if backend == "mjx" else found(num_envs=num_envs, seed=seed)
+    return found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **options)

@@ -1,5 +1,6 @@
 """The fit of one model: the split, early stopping, and that it learns."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -55,7 +56,7 @@ def test_fit_learns_the_mean_and_the_noise(linear, fit, key):
     model = dynamics.init(key, settings, SPEC)
     fitted = fit(model, jnp.int32(CAPACITY), jnp.int32(200), key)
     obs, action = jnp.array([[0.5, -0.5]]), jnp.array([[1.0]])
-    mean, log_variance = dynamics.forward(fitted, obs, action, net=dynamics.network(settings, SPEC))
+    mean, log_variance, _ = dynamics.forward(fitted, obs, action, net=dynamics.network(settings, SPEC))
     np.testing.assert_allclose(mean[0], [0.5, -0.1, -0.5], atol=0.05)
     np.testing.assert_allclose(np.exp(log_variance[0, :2] / 2), 0.1, rtol=0.3)
     # The best that any model can do is the noise's variance on two of three outputs: 0.01 · 2 / 3.
@@ -113,3 +114,31 @@ def test_training_rows_are_uniform(key):
     split = dynamics.Split.draw(key, jnp.int32(50), CAPACITY, 5)
     counts = np.bincount(split.train_rows(key, 40_000, 5), minlength=50)
     assert scipy.stats.chisquare(counts[counts > 0]).pvalue > 1e-3
+
+
+def test_where_the_rule_is_not_known_termination_is_learned(linear, key):
+    """Rows that terminate where s_0 > 0.5: the learned probability says so, and predictions are drawn with it."""
+    settings, rows = linear
+    spec = dataclasses.replace(SPEC, terminated=None)
+    rows = rows.at[:, -1].set(rows[:, 0] > 0.5)
+    net = dynamics.network(settings, spec)
+
+    @jax.jit
+    def run(key):
+        split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
+        whitening = jnp.zeros(3), jnp.ones(3)
+        model = dynamics.init(key, settings, spec)
+        hyper = Hyper.of(settings)
+        return dynamics.fit(model, rows, split, whitening, hyper, key, jnp.int32(200), settings=settings, spec=spec)
+
+    fitted = run(key)
+    obs = jnp.array([[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [2.0, -1.0]])
+    logit = dynamics.forward(fitted, obs, jnp.zeros((4, 1)), net=net).logit
+    np.testing.assert_array_less(jax.nn.sigmoid(logit[:2]), 0.05)
+    np.testing.assert_array_less(0.95, jax.nn.sigmoid(logit[2:]))
+    # On the border predictions are drawn, with the learned probability.
+    border, action = jnp.full((4000, 2), jnp.array([0.5, 0.0])), jnp.zeros((4000, 1))
+    drawn = dynamics.predict(fitted, border, action, key, net=net, spec=spec).terminated
+    chance = float(jax.nn.sigmoid(dynamics.forward(fitted, border[0], action[0], net=net).logit))
+    assert 0.02 < chance < 0.98
+    assert float(drawn.mean()) == pytest.approx(chance, abs=4 * np.sqrt(chance * (1 - chance) / 4000))

@@ -13,8 +13,8 @@ from vecpsmbpo.envs import specs
 from vecpsmbpo.envs.registry import TASKS
 from vecpsmbpo.settings import SettingError
 
-PORTED = [name for name, task in TASKS.items() if task.mjx]
-HOSTED = [name for name, task in TASKS.items() if task.host]
+PORTED = [name for name, task in TASKS.items() if task.sizes and "mjx" in task.code]
+HOSTED = [name for name, task in TASKS.items() if task.sizes and "host" in task.code]
 
 
 @pytest.fixture(scope="module", params=PORTED)
@@ -41,9 +41,9 @@ def test_sizes_are_those_of_the_registry(port):
     spec, task = port.env.spec, TASKS[port.env.spec.name]
     host = envs.make(spec.name, "host")
     state = port.env.reset(jax.random.key(0))
-    assert state.obs.shape == (task.obs_size,) == host.reset().shape[1:]
-    assert port.env.action_size == task.action_size
-    assert spec.episode_length == host.episode_length == task.episode_length
+    assert state.obs.shape == (task.sizes.obs_size,) == host.reset().shape[1:]
+    assert port.env.action_size == task.sizes.action_size
+    assert spec.episode_length == host.episode_length == task.sizes.episode_length
 
 
 def test_resets_are_distributed_as_the_original_s(port):
@@ -53,7 +53,7 @@ def test_resets_are_distributed_as_the_original_s(port):
 def test_ball_in_cup_rewards_the_ball_in_the_cup():
     """The reward at states placed by hand, against dm_control's own."""
     env = envs.make("ball_in_cup", "mjx")
-    physics = envs.make("ball_in_cup", "host")._simulators[0].env.physics
+    physics = envs.make("ball_in_cup", "host").simulators[0].env.physics
     inside = 0
     for x, z in np.random.default_rng(1).uniform([-0.05, 0.25], [0.05, 0.45], (200, 2)):
         with physics.reset_context():
@@ -66,8 +66,8 @@ def test_ball_in_cup_rewards_the_ball_in_the_cup():
 
 def test_sparse_cartpole_rewards_balance():
     env = envs.make("cartpole_swingup_sparse", "mjx")
-    physics = envs.make("cartpole_swingup_sparse", "host")._simulators[0].env.physics
-    task = envs.make("cartpole_swingup_sparse", "host")._simulators[0].env.task
+    physics = envs.make("cartpole_swingup_sparse", "host").simulators[0].env.physics
+    task = envs.make("cartpole_swingup_sparse", "host").simulators[0].env.task
     for qpos in ([0.0, 0.0], [0.0, 0.09], [0.0, 0.11], [0.24, 0.0], [0.26, 0.0], [0.0, np.pi]):
         with physics.reset_context():
             physics.data.qpos[:] = qpos

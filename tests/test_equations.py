@@ -49,7 +49,7 @@ def test_prediction_adds_the_residual_to_the_state_and_whitens_its_inputs(key):
     params["params"]["Dense_2"]["bias"] = bias
     net = dynamics.network(settings, spec)
     obs, action = jnp.ones(spec.obs_size), jnp.zeros(spec.action_size)
-    next_obs, reward = dynamics.predict(model.replace(params=params), obs, action, key, net=net)
+    next_obs, reward, _ = dynamics.predict(model.replace(params=params), obs, action, key, net=net, spec=spec)
     noise = 5 * np.exp(-5.0)  # five standard deviations at the lower bound of the variance
     np.testing.assert_allclose(next_obs, 1 + np.arange(spec.obs_size), atol=noise)
     assert reward == pytest.approx(spec.obs_size, abs=noise)

@@ -27,7 +27,7 @@ from vecpsmbpo import envs
 from vecpsmbpo.envs.mjx.simulator import Physics
 from vecpsmbpo.envs.registry import TASKS
 
-PORTED = [name for name, task in TASKS.items() if task.mjx]
+PORTED = [name for name, task in TASKS.items() if task.sizes and "mjx" in task.code]
 NEAR = 1e-4  # a state this close to a termination threshold may fall on either side in float32
 
 
@@ -48,7 +48,7 @@ class Step:
 
 def simulator_data(host: Any) -> Any:
     """`mjData` of the first simulator of a host environment."""
-    env = host._simulators[0].env
+    env = host.simulators[0].env
     return env.physics.data if hasattr(env, "physics") else env.unwrapped.data
 
 
@@ -194,7 +194,8 @@ def main(arguments: list[str]) -> None:
     states, episodes = int(options.get("states", 2000)), int(options.get("episodes", 30))
     trained = dict(trained_policy(text.split("=", 1)[1]) for text in arguments if text.startswith("run_dir="))
     names = [text for text in arguments if "=" not in text] or PORTED
-    rows = []
+    rows: list[dict[str, Any]] = []
+    writer: Any = None
     for name in names:
         port = Port(name)
         policies = {"random": uniform(1, port.env.action_size, 0), "held": uniform(10, port.env.action_size, 1)}
@@ -204,13 +205,15 @@ def main(arguments: list[str]) -> None:
         for policy, act in policies.items():
             steps = collect(name, act, states, seed=len(rows))
             rows.append({"task": name, "policy": policy, **compare_steps(port, steps), **whole})
-            print(f"{name} {policy}", file=sys.stderr, flush=True)
-    writer = csv.DictWriter(sys.stdout, rows[0], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
-    table = Table(*(name for name in rows[0] if not name.endswith("_se")), title="MJX float32 against the original")
+            if writer is None:
+                writer = csv.DictWriter(sys.stdout, rows[0], lineterminator="\n")
+                writer.writeheader()
+            writer.writerow({k: f"{v:.3g}" if isinstance(v, float) else v for k, v in rows[-1].items()})
+            sys.stdout.flush()  # a long job that is cut short keeps what it has
+    shown = [column for column in rows[0] if not column.endswith("_se")]
+    table = Table(*shown, title="MJX float32 against the original")
     for row in rows:
-        table.add_row(*(f"{v:.2g}" if isinstance(v, float) else str(v) for k, v in row.items() if not k.endswith("_se")))
+        table.add_row(*(f"{row[k]:.2g}" if isinstance(row[k], float) else str(row[k]) for k in shown))
     Console(stderr=True, width=200).print(table)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from vecpsmbpo.layout import Layout
@@ -42,7 +43,7 @@ class Checkpoints:
 
     def save(self, step: int, state: TrainState, host: dict[str, Any], layout: Layout) -> None:
         """Saves the train state, and what the host knows beside it in JSON's types."""
-        plain = jax.tree.map(_key_to_data, layout.unpad(state))
+        plain = jax.tree.map(_storable, layout.unpad(state))
         items = ocp.args.Composite(state=ocp.args.StandardSave(plain), host=ocp.args.JsonSave(host))
         self._manager.save(step, args=items, force=True)
         self._manager.wait_until_finished()
@@ -59,7 +60,7 @@ class Checkpoints:
         host_memory = jax.sharding.SingleDeviceSharding(jax.local_devices(backend="cpu")[0])
         plain = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=host_memory),
-            jax.eval_shape(lambda tree: jax.tree.map(_key_to_data, tree), unpadded),
+            jax.eval_shape(lambda tree: jax.tree.map(_storable, tree), unpadded),
         )
         for step in reversed(self.steps()):
             try:
@@ -72,7 +73,7 @@ class Checkpoints:
                 warn(f"the checkpoint at step {step} is damaged; taking the one before it")
                 self._manager.delete(step)
                 continue
-            state = jax.tree.map(_data_to_key, items["state"], unpadded)
+            state = jax.tree.map(_restored, items["state"], unpadded)
             return Saved(step, layout.place(state), items["host"])
         return None
 
@@ -84,9 +85,15 @@ def _is_key(x: Any) -> bool:
     return jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
-def _key_to_data(x: Any) -> Any:
-    return jax.random.key_data(x) if _is_key(x) else x
+def _storable(x: Any) -> Any:
+    """`x` as orbax can store it: keys as numbers; arrays without elements, which it refuses, as one zero."""
+    if _is_key(x):
+        return jax.random.key_data(x)
+    return x if x.size else jnp.zeros(1, x.dtype)
 
 
-def _data_to_key(x: Any, like: Any) -> Any:
-    return jax.random.wrap_key_data(x) if _is_key(like) else x
+def _restored(x: Any, like: Any) -> Any:
+    """The inverse of `_storable`."""
+    if _is_key(like):
+        return jax.random.wrap_key_data(x)
+    return x if like.size else jnp.zeros(like.shape, like.dtype)

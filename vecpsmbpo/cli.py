@@ -14,6 +14,7 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo train -m env=hopper real_ratio=0,0.05   one run after the other, for every value (Hydra multirun)
   vecpsmbpo eval run_dir=runs/x episodes=10         evaluate it
   vecpsmbpo envs                                    tasks, backends, sizes
+  vecpsmbpo theory                                  the paper's theory in numbers, in seconds
 
 {groups}
 settings: {settings}
@@ -44,11 +45,15 @@ def _dispatch(arguments: list[str]) -> int:
         return _envs(rest)
     if command == "eval":
         return _eval(rest)
+    if command == "theory":
+        from vecpsmbpo.theory import report
+
+        return report.run(rest)
     if command == "train":
         multirun = {"-m", "--multirun"} & set(rest)
         overrides = [text for text in rest if text not in ("-m", "--multirun")]
         return _multirun(overrides) if multirun else _train(overrides)
-    raise SettingError(f"{command}: no such command; one of train, eval, envs")
+    raise SettingError(f"{command}: no such command; one of train, eval, envs, theory")
 
 
 def _train(overrides: list[str]) -> int:
@@ -107,12 +112,15 @@ def _envs(rest: list[str]) -> int:
     from rich.console import Console
     from rich.table import Table
 
+    from vecpsmbpo import config
     from vecpsmbpo.envs.registry import TASKS
 
-    table = Table("task", "backends", "obs", "action", "episode", "suite", "installed", box=None)
+    table = Table("task", "backends", "obs", "action", "episode", "options", "suite", "installed", box=None)
     for name, task in TASKS.items():
-        row = (task.obs_size, task.action_size, task.episode_length)
-        table.add_row(name, ", ".join(task.backends), *map(str, row), task.suite, "yes" if task.installed else "no")
+        sizes = map(str, task.sizes) if task.sizes else ("any", "any", "its own")
+        options = " ".join(f"env.{option}" for option in config.env_options(name))
+        installed = "yes" if task.installed else f"no: pip install 'vecpsmbpo[{task.extra}]'" if task.extra else "no"
+        table.add_row(name, ", ".join(task.backends), *sizes, options, task.suite, installed)
     Console(width=120).print(table)
     return 0
 

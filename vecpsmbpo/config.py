@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
@@ -28,6 +29,12 @@ def options(group: str) -> list[str]:
     """The names that `group=` may take."""
     folder = resources.files("vecpsmbpo.configs") / group
     return sorted(Path(item.name).stem for item in folder.iterdir() if item.name.endswith(".yaml"))
+
+
+def env_options(env: str) -> dict[str, Any]:
+    """The options `env.*` of a task and their defaults; `???` where one must be given."""
+    text = (resources.files("vecpsmbpo.configs") / "env" / f"{env}.yaml").read_text()
+    return {name: value for name, value in yaml.safe_load(text)["env"].items() if name != "name"}
 
 
 def closest(name: str, known: Iterable[str]) -> str:
@@ -66,7 +73,25 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
         values = _sweep_values(override) if override.is_sweep_override() else [override.value()]
         for value in values:
             found[name] = _check_override(name, value)
+    _check_env_options(found)
     return found
+
+
+def _check_env_options(found: dict[str, Any]) -> None:
+    """That the task has the options given; a run that is resumed knows its task by itself."""
+    given = [name for name in found if name.startswith("env.")]
+    if "env" not in found and "run_dir" in found:
+        return
+    for name in given:
+        env = found.get("env", _default("env"))
+        if name.removeprefix("env.") not in env_options(env):
+            has = ", ".join(f"env.{option}" for option in env_options(env)) or "none"
+            raise SettingError(f"{name}: no such option of env={env}; it has {has}")
+
+
+def _default(group: str) -> str:
+    text = (resources.files("vecpsmbpo.configs") / "config.yaml").read_text()
+    return next(entry[group] for entry in yaml.safe_load(text)["defaults"] if group in entry)
 
 
 def _sweep_values(override: Override) -> list[Any]:
@@ -78,6 +103,8 @@ def _check_override(name: str, value: Any) -> Any:
     if name in GROUPS:
         if value not in options(name):
             raise SettingError(f"{name}={value}: {closest(str(value), options(name))}")
+        return value
+    if name.startswith("env."):
         return value
     if name not in FIELDS:
         raise SettingError(f"{name}: no such setting; {closest(name, FIELDS)}")
@@ -106,8 +133,12 @@ def compose(overrides: Sequence[str]):
 def from_tree(tree: DictConfig, overrides: Sequence[str]):
     """Settings from what Hydra composed, with the backend and the run directory resolved."""
     values: Any = OmegaConf.to_container(tree, resolve=True)
+    values["env_options"] = {name: value for name, value in values["env"].items() if name != "name"}
     for group in GROUPS:
         values[group] = values[group]["name"]
+    for name, value in values["env_options"].items():
+        if value == "???":
+            raise SettingError(f"env.{name}: must be given with env={values['env']}")
     values["backend"] = registry.resolve_backend(values["env"], check("backend", values["backend"]))
     settings = build(values)
     if not settings.run_dir:
@@ -117,15 +148,19 @@ def from_tree(tree: DictConfig, overrides: Sequence[str]):
 
 def _default_run_dir(settings, overrides: Sequence[str]) -> str:
     """The same command gives the same directory, so that running it again goes on with the run."""
-    parts = [settings.env, settings.algo, settings.size, f"seed{settings.seed}"]
     extra = sorted(text for text in overrides if text.split("=")[0].lstrip("+") not in _UNNAMED)
-    parts += [text.replace("/", "_") for text in extra if not text.startswith("hydra")]
+    task = [str(value) for _, value in settings.env_options if any(text.startswith("env.") for text in extra)]
+    others = [text for text in extra if not text.startswith(("hydra", "env."))]
+    parts = [settings.env, *task, settings.algo, settings.size, f"seed{settings.seed}", *others]
+    # Only what the command line reads back without quotes.
+    parts = [re.sub(r"[^\w.+-]", "_", part.replace("=", "")) for part in parts]
     return str(Path("runs") / "-".join(parts))
 
 
 def save(settings, run_dir: Path) -> None:
     """Writes `config.yaml`."""
-    text = yaml.safe_dump(dataclasses.asdict(settings), sort_keys=False)
+    values = {**dataclasses.asdict(settings), "env_options": dict(settings.env_options)}
+    text = yaml.safe_dump(values, sort_keys=False)
     (run_dir / CONFIG_FILE).write_text(text)
 
 
@@ -166,11 +201,12 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None):
     stored = load(run_dir)
     changed = {}
     for name, value in given.items():
-        if name == "run_dir" or value == getattr(stored, name) or (name, value) == ("backend", "auto"):
+        had = dict(stored.env_options).get(name.removeprefix("env.")) if "." in name else getattr(stored, name)
+        if name == "run_dir" or value == had or (name, value) == ("backend", "auto"):
             continue
         if name not in CHANGEABLE:
             raise SettingError(
-                f"{name}={value}: contradicts the run in {run_dir}, which has {name}={getattr(stored, name)}; "
+                f"{name}={value}: contradicts the run in {run_dir}, which has {name}={had}; "
                 "leave it out to resume, or give another run_dir"
             )
         changed[name] = value

@@ -200,8 +200,13 @@ class ScanDriver:
         counters, seeds, end = observe_and_learn(
             self.algorithm, state.counters, seeds, transition, truncated, keys[:, 1:3], learning
         )
-        fresh = jax.vmap(self.env.reset)(keys[:, 3])
-        env = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(end.done, new, old), fresh, env)
+
+        def begin_episodes(env):
+            fresh = jax.vmap(self.env.reset)(keys[:, 3])
+            return jax.tree.map(lambda new, old: jax.vmap(jnp.where)(end.done, new, old), fresh, env)
+
+        # Not at every step: the resets of other libraries' environments cost as much as a step of physics.
+        env = jax.lax.cond(jnp.any(end.done), begin_episodes, lambda env: env, env)
         return TrainState(counters, seeds, env), end
 
     def _evaluate_local(self, seeds: SeedState, keys: jax.Array) -> tuple[jax.Array, jax.Array]:

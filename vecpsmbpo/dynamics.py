@@ -1,13 +1,15 @@
 """ONE dynamics model: loss (equation 17), fit with early stopping, prediction (equations 20 and 21)."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from vecpsmbpo import networks, optim, replay
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import EnvSpec, Hyper, Model, Moments, Params
+from vecpsmbpo.types import EnvSpec, Hyper, Model, Moments, Params, Transition
 
 VALIDATION_BATCH = 512
 
@@ -48,7 +50,12 @@ class Split(NamedTuple):
 
 
 def network(settings: Settings, spec: EnvSpec) -> networks.GaussianMLP:
-    return networks.GaussianMLP(spec.obs_size + 1, settings.model_hidden_size, settings.model_hidden_layers)
+    return networks.GaussianMLP(
+        output_size=spec.obs_size + 1,
+        hidden_size=settings.model_hidden_size,
+        hidden_layers=settings.model_hidden_layers,
+        predicts_termination=spec.terminated is None,
+    )
 
 
 def init(key: jax.Array, settings: Settings, spec: EnvSpec) -> Model:
@@ -68,25 +75,79 @@ def scaling(moments: Moments, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
     return moments.mean, jnp.where(std > 1e-6, std, 1.0)
 
 
-def forward(model: Model, obs: jax.Array, action: jax.Array, *, net: networks.GaussianMLP):
-    """Mean and log-variance of (Δs, r), [..., O + 1] each (equation 20)."""
+def forward(model: Model, obs: jax.Array, action: jax.Array, *, net: networks.GaussianMLP) -> networks.Prediction:
+    """What the model says of (Δs, r) (equation 20). Shapes: obs [..., O], action [..., A]."""
     inputs = jnp.concatenate([obs, action], axis=-1)
-    return net.apply(model.params, (inputs - model.input_mean) / model.input_std)
+    prediction: Any = net.apply(model.params, (inputs - model.input_mean) / model.input_std)
+    return prediction
 
 
-def predict(model: Model, obs: jax.Array, action: jax.Array, key: jax.Array, *, net: networks.GaussianMLP):
-    """A draw of (s', r) ~ N((s + Δs, r), σ²) (equation 21).
+class Successor(NamedTuple):
+    """A draw from the model: next_obs [..., O], reward [...], terminated [...] bool."""
 
-    Shapes: obs [..., O], action [..., A] -> next_obs [..., O], reward [...].
+    next_obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+
+
+def predict(
+    model: Model, obs: jax.Array, action: jax.Array, key: jax.Array, *, net: networks.GaussianMLP, spec: EnvSpec
+) -> Successor:
+    """A draw of (s', r) ~ N((s + Δs, r), σ²) (equation 21), and whether it ends the episode: by the task's own rule,
+    or drawn with the learned probability where that is not known.
+
+    Shapes: obs [..., O], action [..., A].
     """
-    mean, log_variance = forward(model, obs, action, net=net)
-    sample = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
-    return obs + sample[..., :-1], sample[..., -1]
+    prediction = forward(model, obs, action, net=net)
+    noise = jax.random.normal(key, prediction.mean.shape)
+    sample = prediction.mean + jnp.exp(0.5 * prediction.log_variance) * noise
+    next_obs, reward = obs + sample[..., :-1], sample[..., -1]
+    if spec.terminated is None:
+        probability = jax.nn.sigmoid(prediction.logit)
+        return Successor(next_obs, reward, jax.random.bernoulli(jax.random.fold_in(key, 1), probability))
+    return Successor(next_obs, reward, spec.terminated(obs, action, next_obs))
 
 
 def negative_log_likelihood(mean: jax.Array, log_variance: jax.Array, target: jax.Array) -> jax.Array:
     """Equation 17 without its constant, elementwise: log σ² / 2 + (y - μ)² / (2 σ²)."""
     return 0.5 * log_variance + 0.5 * (target - mean) ** 2 * jnp.exp(-log_variance)
+
+
+def _targets(batch: Transition) -> jax.Array:
+    """(Δs, r), [B, O + 1]."""
+    return jnp.concatenate([batch.next_obs - batch.obs, batch.reward[:, None]], axis=-1)
+
+
+def loss(model: Model, batch: Transition, *, net: networks.GaussianMLP) -> jax.Array:
+    """Equation 17, averaged over rows and outputs; where termination is learned, plus its cross-entropy.
+
+    Args:
+        batch: leaves [B, ...].
+    """
+    prediction = forward(model, batch.obs, batch.action, net=net)
+    value = jnp.mean(negative_log_likelihood(prediction.mean, prediction.log_variance, _targets(batch)))
+    if prediction.logit is not None:
+        value += jnp.mean(optax.sigmoid_binary_cross_entropy(prediction.logit, batch.terminated))
+    return value
+
+
+def validation_error(
+    model: Model, rows_of: Callable[[jax.Array], Transition], split: Split, block: int, *, net: networks.GaussianMLP
+) -> jax.Array:
+    """Mean squared error over the validation rows, [], in batches of a fixed size.
+
+    Args:
+        rows_of: indices [B] -> the rows of D_E, leaves [B, ...].
+    """
+
+    def add_batch(index, total):
+        rows, exists = split.validation_rows(index * VALIDATION_BATCH, VALIDATION_BATCH, block)
+        batch = rows_of(rows)
+        mean = forward(model, batch.obs, batch.action, net=net).mean
+        return total + jnp.sum(jnp.where(exists, jnp.mean((mean - _targets(batch)) ** 2, axis=-1), 0.0))
+
+    batches = -(-split.blocks // VALIDATION_BATCH)
+    return jax.lax.fori_loop(0, batches, add_batch, 0.0) / jnp.maximum(split.blocks, 1)
 
 
 def fit(
@@ -114,32 +175,19 @@ def fit(
     net, block = network(settings, spec), settings.validation_block
     model = model.replace(input_mean=whitening[0], input_std=whitening[1])
 
-    def examples(indices):
-        transition = replay.unpack(real[indices], spec.obs_size, spec.action_size)
-        target = jnp.concatenate([transition.next_obs - transition.obs, transition.reward[:, None]], axis=-1)
-        return transition.obs, transition.action, target
+    def rows_of(indices: jax.Array) -> Transition:
+        return replay.unpack(real[indices], spec.obs_size, spec.action_size)
 
-    def loss(params: Params, key: jax.Array) -> jax.Array:
-        obs, action, target = examples(split.train_rows(key, settings.model_batch_size, block))
-        mean, log_variance = forward(model.replace(params=params), obs, action, net=net)
-        return jnp.mean(negative_log_likelihood(mean, log_variance, target))
-
-    def step(carry, key):
-        params, optimizer = carry
-        value, gradient = jax.value_and_grad(loss)(params, key)
+    def step(params: Params, optimizer: Any, key: jax.Array):
+        batch = rows_of(split.train_rows(key, settings.model_batch_size, block))
+        objective = lambda params: loss(model.replace(params=params), batch, net=net)  # noqa: E731
+        value, gradient = jax.value_and_grad(objective)(params)
         # L2 in the gradient, as torch's Adam(weight_decay) of both MBPO codebases has it.
         gradient = jax.tree.map(lambda g, p: g + hyper.model_weight_decay * p, gradient, params)
-        return optim.step(gradient, optimizer, params, hyper.model_learning_rate), value
+        return *optim.step(gradient, optimizer, params, hyper.model_learning_rate), value
 
     def validate(params: Params) -> jax.Array:
-        def batch(index, total):
-            rows, exists = split.validation_rows(index * VALIDATION_BATCH, VALIDATION_BATCH, block)
-            obs, action, target = examples(rows)
-            mean, _ = forward(model.replace(params=params), obs, action, net=net)
-            return total + jnp.sum(jnp.where(exists, jnp.mean((mean - target) ** 2, axis=-1), 0.0))
-
-        batches = -(-split.blocks // VALIDATION_BATCH)
-        return jax.lax.fori_loop(0, batches, batch, 0.0) / jnp.maximum(split.blocks, 1)
+        return validation_error(model.replace(params=params), rows_of, split, block, net=net)
 
     steps_per_epoch = -(-split.blocks * (block - 1) // settings.model_batch_size)
 
@@ -149,7 +197,7 @@ def fit(
         def body(index, inner):
             params, optimizer, total = inner
             step_key = jax.random.fold_in(jax.random.fold_in(key, count), index)
-            (params, optimizer), value = step((params, optimizer), step_key)
+            params, optimizer, value = step(params, optimizer, step_key)
             return params, optimizer, total + value
 
         params, optimizer, total = jax.lax.fori_loop(0, steps_per_epoch, body, (params, optimizer, 0.0))

@@ -28,7 +28,7 @@ def evaluate(stored: Settings, settings: Settings) -> int:
     trained, saved = restore(stored)
     driver = trained if settings == stored else make_driver(settings)
     returns = driver.evaluate(saved.state, evaluation_keys(settings, saved.step), settings.eval_episodes)
-    table = Table(title=f"{settings.env} ({settings.backend}) at step {saved.step}, policy: {settings.eval_policy}")
+    table = Table(title=f"{settings.task} ({settings.backend}) at step {saved.step}, policy: {settings.eval_policy}")
     for column in ("seed", "episodes", "return", "± s.d.", "lowest", "highest", "length"):
         table.add_column(column, justify="right")
     for index in range(settings.num_seeds):

@@ -57,14 +57,13 @@ def step(
         obs: [B, O].
 
     Returns:
-        Transition with leaves [B, ...]; the policy's sampled action, the model's sampled successor and reward
-        (equation 21), and the task's own termination rule.
+        Transition with leaves [B, ...]; the policy's sampled action, the model's sampled successor, reward and end.
     """
     action_key, model_key = jax.random.split(key)
     action, _ = sac.make_networks(settings, spec).actor.law(actor, obs).sample(action_key)
     net = dynamics.network(settings, spec)
-    next_obs, reward = dynamics.predict(model, obs, action, model_key, net=net)
-    return Transition(obs, action, reward, next_obs, spec.terminated(obs, action, next_obs))
+    next_obs, reward, terminated = dynamics.predict(model, obs, action, model_key, net=net, spec=spec)
+    return Transition(obs, action, reward, next_obs, terminated)
 
 
 def start_states(real: jax.Array, rows: jax.Array, key: jax.Array, count: int, spec: EnvSpec) -> jax.Array:

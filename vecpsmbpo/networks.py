@@ -15,24 +15,42 @@ model_init = nn.initializers.variance_scaling(1.0, "fan_in", "truncated_normal")
 policy_init = nn.initializers.variance_scaling(1.0, "fan_in", "uniform")
 
 
+class Prediction(NamedTuple):
+    """What a dynamics model says of (Δs, r), and, where it learns that, of termination.
+
+    Attributes:
+        mean, log_variance: [..., O + 1].
+        logit: [...] of the probability that the episode terminates, or None.
+    """
+
+    mean: jax.Array
+    log_variance: jax.Array
+    logit: jax.Array | None
+
+
 class GaussianMLP(nn.Module):
-    """Diagonal Gaussian over (Δs, r), with its log-variance softly clamped to [-10, 2] (A.1)."""
+    """Diagonal Gaussian over (Δs, r), with its log-variance softly clamped to [-10, 2] (A.1).
+
+    Attributes:
+        predicts_termination: one more output, for tasks whose termination rule is not known.
+    """
 
     output_size: int
     hidden_size: int
     hidden_layers: int
+    predicts_termination: bool = False
 
     @nn.compact
-    def __call__(self, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """inputs [..., O + A], whitened -> mean, log-variance [..., O + 1] each."""
+    def __call__(self, inputs: jax.Array) -> Prediction:
+        """inputs [..., O + A], whitened."""
         hidden = inputs
         for _ in range(self.hidden_layers):
             hidden = nn.swish(nn.Dense(self.hidden_size, kernel_init=model_init)(hidden))
-        outputs = nn.Dense(2 * self.output_size, kernel_init=model_init)(hidden)
-        mean, log_variance = jnp.split(outputs, 2, axis=-1)
+        outputs = nn.Dense(2 * self.output_size + self.predicts_termination, kernel_init=model_init)(hidden)
+        mean, log_variance, rest = jnp.split(outputs, [self.output_size, 2 * self.output_size], axis=-1)
         log_variance = MAX_LOG_VARIANCE - nn.softplus(MAX_LOG_VARIANCE - log_variance)
         log_variance = MIN_LOG_VARIANCE + nn.softplus(log_variance - MIN_LOG_VARIANCE)
-        return mean, log_variance
+        return Prediction(mean, log_variance, rest[..., 0] if self.predicts_termination else None)
 
 
 class ReluMLP(nn.Module):

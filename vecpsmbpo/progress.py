@@ -28,7 +28,7 @@ class Display:
             disable=not self._live,
         )
         self._task = self._progress.add_task(
-            f"{settings.env} {settings.algo}", total=settings.total_steps, completed=env_steps, news=""
+            f"{settings.task} {settings.algo}", total=settings.total_steps, completed=env_steps, news=""
         )
 
     def __enter__(self) -> "Display":

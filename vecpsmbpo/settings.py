@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 Range = tuple[float | None, float | None]
+Options = tuple[tuple[str, Any], ...]  # name and value of each `env.*` option, in the order of names
 
 
 class SettingError(Exception):
@@ -33,6 +34,7 @@ class Settings:
 
     # what runs
     env: str
+    env_options: Options = ()
     algo: str
     size: str
     backend: str = _choice("auto", "mjx", "host")
@@ -42,7 +44,7 @@ class Settings:
     run_dir: str
     # the loop around it
     epoch_steps: int = _whole(1)
-    episode_length: int = _whole(1)
+    episode_length: int = _whole(0)
     eval_episodes: int = _whole(1)
     eval_policy: str = _choice("posterior", "best", "average")
     checkpoint_every: int = _whole(1)
@@ -85,6 +87,11 @@ class Settings:
     temperature: float = _real(0, open_low=True)
 
     @property
+    def task(self) -> str:
+        """The task in words: `hopper`, `dm_control finger spin`."""
+        return " ".join([self.env, *(str(value) for _, value in self.env_options)])
+
+    @property
     def n_members(self) -> int:
         """N·M, the policies that the posterior draws from."""
         return self.n_models * self.n_policies
@@ -99,7 +106,8 @@ class Settings:
         return round(1 / self.validation_ratio)
 
 
-FIELDS = {field.name: field for field in dataclasses.fields(Settings)}
+# The settings that a command line names; the options of a task are `env.*` there.
+FIELDS = {field.name: field for field in dataclasses.fields(Settings) if field.name != "env_options"}
 
 # Settings that a resumed run may change: they steer the loop around the run, not what it computes.
 CHANGEABLE = frozenset({"total_steps", "eval_episodes", "eval_policy", "checkpoint_every", "devices", "compile_cache"})
@@ -160,7 +168,8 @@ def build(values: Mapping[str, Any]) -> Settings:
     Raises:
         SettingError: a value is wrong, or two contradict.
     """
-    settings = Settings(**{name: check(name, values[name]) for name in FIELDS})
+    options = tuple(sorted(dict(values.get("env_options", ())).items()))
+    settings = Settings(env_options=options, **{name: check(name, values[name]) for name in FIELDS})
     if settings.epoch_steps % settings.model_update_every:
         raise SettingError(
             f"model_update_every={settings.model_update_every}: must divide epoch_steps={settings.epoch_steps}"

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ import numpy as np
 from vecpsmbpo import checkpoint, config, envs, metrics, resources, runtime
 from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
 from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
-from vecpsmbpo.envs import specs
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.progress import Display, Stopwatch
 from vecpsmbpo.settings import Settings
@@ -36,15 +36,17 @@ class Diverged(Exception):
 
 
 def make_driver(settings: Settings) -> Driver:
-    """The algorithm on the task, on this process's devices. `runtime.configure` comes first."""
-    algorithm = PsMbpo(settings, specs.get(settings.env), Layout.of(settings))
-    if settings.backend == "mjx":
-        return ScanDriver(algorithm, envs.make(settings.env, "mjx"))
+    """The algorithm on the task, on this process's devices. `runtime.configure` comes first.
 
-    def make_env(**kwargs: Any):
-        return envs.make(settings.env, "host", **kwargs)
-
-    return HostDriver(algorithm, make_env)
+    Raises:
+        SettingError: there is no such task (`envs.make`).
+    """
+    make_env = partial(envs.make, settings.env, settings.backend, **dict(settings.env_options))
+    env = make_env(seed=settings.seed)
+    if not settings.episode_length:
+        settings = dataclasses.replace(settings, episode_length=env.spec.episode_length)
+    algorithm = PsMbpo(settings, env.spec, Layout.of(settings))
+    return ScanDriver(algorithm, env) if settings.backend == "mjx" else HostDriver(algorithm, make_env)
 
 
 def initial_inputs(settings: Settings) -> tuple[jax.Array, Hyper]:
@@ -125,7 +127,7 @@ class _Run:
     def _introduce(self) -> None:
         settings, layout = self.settings, self.driver.layout
         self.display.say(
-            f"{settings.env} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × "
+            f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × "
             f"N = {settings.n_models} models × M = {settings.n_policies} policies, "
             f"{settings.updates_per_step} updates per step, on {layout.mesh.size} {jax.default_backend()} device(s)"
         )

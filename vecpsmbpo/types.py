@@ -15,6 +15,7 @@ from flax import struct
 from vecpsmbpo.settings import Settings
 
 Params = Any  # a pytree of arrays
+TerminationRule = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
 
 @dataclass(frozen=True)
@@ -27,14 +28,15 @@ class EnvSpec:
         action_size: A; actions lie in [-1, 1].
         episode_length: control steps after which an episode is truncated.
         terminated: (obs [..., O], action [..., A], next_obs [..., O]) -> bool [...]. The task's own termination
-            rule as a function of observations; imagined rollouts end by it.
+            rule as a function of observations; imagined rollouts end by it. None: not known, and the dynamics models
+            learn it from real terminations.
     """
 
     name: str
     obs_size: int
     action_size: int
     episode_length: int
-    terminated: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+    terminated: TerminationRule | None
 
 
 class Transition(NamedTuple):

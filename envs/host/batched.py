@@ -53,23 +53,24 @@ class HostEnv:
     Attributes:
         spec: of the task.
         episode_length: the time limit, `spec.episode_length` unless set otherwise.
+        simulators: one per environment.
     """
 
     def __init__(self, spec: EnvSpec, simulators: Sequence[Simulator]):
         self.spec = spec
         self.episode_length = spec.episode_length
-        self._simulators = list(simulators)
-        self._lengths = np.zeros(len(self._simulators), np.int64)
-        self._obs = np.zeros((len(self._simulators), spec.obs_size), np.float32)
+        self.simulators = list(simulators)
+        self._lengths = np.zeros(len(self.simulators), np.int64)
+        self._obs = np.zeros((len(self.simulators), spec.obs_size), np.float32)
 
     @property
     def num_envs(self) -> int:
-        return len(self._simulators)
+        return len(self.simulators)
 
     def reset(self) -> np.ndarray:
         """Begins an episode everywhere: obs [B, O]."""
         self._lengths[:] = 0
-        self._obs = np.stack([simulator.reset() for simulator in self._simulators]).astype(np.float32)
+        self._obs = np.stack([simulator.reset() for simulator in self.simulators]).astype(np.float32)
         return self._obs
 
     def step(self, actions: np.ndarray) -> HostStep:
@@ -82,14 +83,14 @@ class HostEnv:
             expected = (self.num_envs, self.spec.action_size)
             raise ValueError(f"actions must have shape {expected}, not {np.shape(actions)}")
         actions = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
-        results = [simulator.step(action) for simulator, action in zip(self._simulators, actions, strict=True)]
+        results = [simulator.step(action) for simulator, action in zip(self.simulators, actions, strict=True)]
         next_obs, reward, terminated = (np.asarray(column) for column in zip(*results, strict=True))
         next_obs = next_obs.astype(np.float32)
         self._lengths += 1
         truncated = (self._lengths >= self.episode_length) & ~terminated
         self._obs = next_obs.copy()
         for index in np.flatnonzero(terminated | truncated):
-            self._obs[index] = self._simulators[index].reset()
+            self._obs[index] = self.simulators[index].reset()
             self._lengths[index] = 0
         return HostStep(self._obs, reward.astype(np.float32), terminated, truncated, next_obs)
 
@@ -98,13 +99,13 @@ class HostEnv:
         return {
             "lengths": self._lengths.tolist(),
             "obs": self._obs.tolist(),
-            "simulators": [simulator.save() for simulator in self._simulators],
+            "simulators": [simulator.save() for simulator in self.simulators],
         }
 
     def load(self, saved: dict[str, Any]) -> np.ndarray:
         """The inverse of `save`: the observations [B, O] that the next actions start from."""
         self._lengths = np.array(saved["lengths"], np.int64)
         self._obs = np.array(saved["obs"], np.float32)
-        for simulator, state in zip(self._simulators, saved["simulators"], strict=True):
+        for simulator, state in zip(self.simulators, saved["simulators"], strict=True):
             simulator.load(state)
         return self._obs

@@ -1,4 +1,4 @@
-"""Gymnasium's MuJoCo tasks on their own simulator."""
+"""Gymnasium's tasks on their own simulators."""
 
 import warnings
 from typing import Any
@@ -6,64 +6,134 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from vecpsmbpo.envs import specs
+from vecpsmbpo.envs import specs, termination
+from vecpsmbpo.envs.host import attributes
 from vecpsmbpo.envs.host.batched import HostEnv, Simulator
 from vecpsmbpo.envs.host.mujoco_state import MujocoState
+from vecpsmbpo.settings import SettingError
+from vecpsmbpo.types import EnvSpec
+
+EPISODE_LENGTH = 1000  # of a task that is registered without a limit
 
 
 class GymnasiumSimulator(Simulator):
-    """One Gymnasium MuJoCo environment without its wrappers."""
+    """One Gymnasium environment with a vector of observations and bounded continuous actions."""
 
-    def __init__(self, env_id: str, seed: int):
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*out of date.*")  # the paper's tasks are the v4 ones
-            self.env: Any = gymnasium.make(env_id).unwrapped
-        self._low, self._high = self.env.action_space.low, self.env.action_space.high
+    def __init__(self, env: Any, seed: int, name: str):
+        """
+        Args:
+            env: a `gymnasium.Env`; its truncations are not heeded, the time limit is HostEnv's.
+            name: for errors.
+
+        Raises:
+            SettingError: observations or actions are of another kind.
+        """
+        _check_spaces(env, name)
+        self.env = env
+        self._low, self._high = env.action_space.low, env.action_space.high
         self._seed: int | None = seed
-        self._state = MujocoState(self.env.model, self.env.data)
+        core = env.unwrapped
+        self._state = MujocoState(core.model, core.data) if _is_mujoco(core) else None
 
     def reset(self) -> np.ndarray:
         obs, _ = self.env.reset(seed=self._seed)
         self._seed = None  # the first reset seeds; later ones go on with the same generator
-        self._state.begin_episode()
+        if self._state:
+            self._state.begin_episode()
         return obs
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
-        self._state.begin_step(action)
-        obs, reward, terminated, _, _ = self.env.step(self._low + (action + 1) * (self._high - self._low) / 2)
+        if self._state:
+            self._state.begin_step(action)
+        scaled = self._low + (action + 1) * (self._high - self._low) / 2
+        obs, reward, terminated, _, _ = self.env.step(scaled.astype(self.env.action_space.dtype))
         return obs, float(reward), bool(terminated)
 
     def save(self) -> dict[str, Any]:
-        generator = self.env.np_random.bit_generator.state
-        return {"seed": self._seed, "physics": self._state.save(), "generator": generator}
+        core = self.env.unwrapped
+        return {
+            "seed": self._seed,
+            "physics": self._state.save() if self._state else None,
+            "attributes": attributes.save(core),
+            "generator": core.np_random.bit_generator.state,
+        }
 
     def load(self, saved: dict[str, Any]) -> None:
+        self.env.reset()  # wrappers refuse a step before it
         self._seed = saved["seed"]
-        action = self._state.load(saved["physics"])
-        if action is not None:
-            self.step(action)
-        self.env.np_random.bit_generator.state = saved["generator"]
+        core = self.env.unwrapped
+        if self._state:
+            action = self._state.load(saved["physics"])
+            if action is not None:
+                self.step(action)
+        attributes.load(core, saved["attributes"])
+        core.np_random.bit_generator.state = saved["generator"]
 
 
-def _batched(name: str, env_id: str, num_envs: int, seed: int) -> HostEnv:
-    return HostEnv(specs.get(name), [GymnasiumSimulator(env_id, seed + index) for index in range(num_envs)])
+def _is_mujoco(core: Any) -> bool:
+    return hasattr(core, "model") and hasattr(core, "data") and hasattr(core.data, "qpos")
+
+
+def _check_spaces(env: Any, name: str) -> None:
+    obs, action = env.observation_space, env.action_space
+    if not isinstance(obs, gymnasium.spaces.Box) or len(obs.shape) != 1:
+        raise SettingError(f"{name}: its observations are {obs}; only vectors (Box of one dimension) can be learned")
+    if not isinstance(action, gymnasium.spaces.Box) or len(action.shape) != 1:
+        raise SettingError(
+            f"{name}: its actions are {action}; only continuous ones (Box of one dimension) can be learned"
+        )
+    if not action.is_bounded():
+        raise SettingError(f"{name}: its actions are {action}; they must be bounded")
+
+
+def any_task(*, num_envs: int, seed: int, id: str) -> HostEnv:
+    """Any registered Gymnasium environment. Termination of its MuJoCo tasks is known; of others it is learned.
+
+    Raises:
+        SettingError: there is no such environment, or it cannot be learned.
+    """
+
+    def make() -> Any:
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message=".*out of date.*")  # the paper's tasks are the v4 ones
+                # No time limit of its own (-1): that is HostEnv's.
+                return gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True)
+        except (gymnasium.error.Error, ModuleNotFoundError) as error:
+            raise SettingError(f"env.id={id}: {str(error).splitlines()[0]}") from None
+
+    return batch(make, num_envs, seed, f"env.id={id}", id, termination.of_gymnasium(id))
+
+
+def batch(make: Any, num_envs: int, seed: int, label: str, name: str, terminated: Any) -> HostEnv:
+    """`num_envs` environments of `make()`, with the spec read off the first."""
+    simulators = [GymnasiumSimulator(make(), seed + index, label) for index in range(num_envs)]
+    env = simulators[0].env
+    limit = (env.spec and gymnasium.spec(env.spec.id).max_episode_steps) or EPISODE_LENGTH
+    spec = EnvSpec(name, env.observation_space.shape[0], env.action_space.shape[0], limit, terminated)
+    return HostEnv(spec, simulators)
+
+
+def _of_paper(name: str, env_id: str, num_envs: int, seed: int) -> HostEnv:
+    env = any_task(num_envs=num_envs, seed=seed, id=env_id)
+    return HostEnv(specs.get(name), env.simulators)
 
 
 def ant(*, num_envs: int, seed: int) -> HostEnv:
     """Ant-v4."""
-    return _batched("ant", "Ant-v4", num_envs, seed)
+    return _of_paper("ant", "Ant-v4", num_envs, seed)
 
 
 def halfcheetah(*, num_envs: int, seed: int) -> HostEnv:
     """HalfCheetah-v4."""
-    return _batched("halfcheetah", "HalfCheetah-v4", num_envs, seed)
+    return _of_paper("halfcheetah", "HalfCheetah-v4", num_envs, seed)
 
 
 def hopper(*, num_envs: int, seed: int) -> HostEnv:
     """Hopper-v4."""
-    return _batched("hopper", "Hopper-v4", num_envs, seed)
+    return _of_paper("hopper", "Hopper-v4", num_envs, seed)
 
 
 def walker2d(*, num_envs: int, seed: int) -> HostEnv:
     """Walker2d-v4."""
-    return _batched("walker2d", "Walker2d-v4", num_envs, seed)
+    return _of_paper("walker2d", "Walker2d-v4", num_envs, seed)

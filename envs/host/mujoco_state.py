@@ -1,5 +1,6 @@
 """Saving and restoring C MuJoCo exactly."""
 
+import copy
 from typing import Any
 
 import mujoco
@@ -12,11 +13,14 @@ class MujocoState:
     """Remembers where the last control step of one simulator began.
 
     The positions and velocities alone do not restore a simulator bit for bit: body frames lag one substep behind
-    them, and tasks read those. Replaying the last control step from the state before it does.
+    them, and tasks read those. Replaying the last control step from the state before it does. Some tasks also move
+    targets by changing the model at the start of an episode: what differs from the model as it was built is saved.
     """
 
     def __init__(self, model: Any, data: Any):
         self._model, self._data = model, data
+        self._built = copy.deepcopy(model)
+        self._fields = [name for name in dir(model) if isinstance(_array(model, name), np.ndarray)]
         self._before: np.ndarray = self._read()
         self._action: np.ndarray | None = None
 
@@ -37,13 +41,26 @@ class MujocoState:
         return {
             "before": self._before.tolist(),
             "action": None if self._action is None else self._action.tolist(),
+            "model": {
+                name: getattr(self._model, name).tolist()
+                for name in self._fields
+                if not np.array_equal(getattr(self._model, name), getattr(self._built, name))
+            },
         }
 
     def load(self, saved: dict[str, Any]) -> np.ndarray | None:
         """Puts the simulator where the last control step began; the action of that step is yet to be replayed."""
+        for name in self._fields:
+            getattr(self._model, name)[...] = saved["model"].get(name, getattr(self._built, name))
         self._before = np.array(saved["before"])
         self._action = None if saved["action"] is None else np.array(saved["action"])
         mujoco.mj_setState(self._model, self._data, self._before, _STATE)
         mujoco.mj_forward(self._model, self._data)
         mujoco.mj_setState(self._model, self._data, self._before, _STATE)  # forward moved the solver's warm start
         return self._action
+
+
+def _array(model: Any, name: str) -> Any:
+    """A field of the model; None where it is none, or text."""
+    value = None if name.startswith("_") else getattr(model, name, None)
+    return value if isinstance(value, np.ndarray) and value.dtype.kind in "biuf" else None

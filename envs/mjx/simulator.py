@@ -73,9 +73,7 @@ class Simulator:
 
     def step(self, physics: Physics, control: jax.Array) -> Physics:
         """One step of the model's timestep. control: [nu]."""
-        data = self._blank.replace(
-            qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.warmstart, ctrl=control
-        )
+        data = self._blank.replace(qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.warmstart, ctrl=control)
         if self._is_runge_kutta:
             return self._runge_kutta(data)
         integrate = mjx.implicit if self._model.opt.integrator == mjx.IntegratorType.IMPLICITFAST else mjx.euler

@@ -1,0 +1,60 @@
+"""Other libraries' JAX environments behind the interface of this one."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+from vecpsmbpo.settings import SettingError
+from vecpsmbpo.types import EnvSpec, TerminationRule
+
+
+class Adapter(Env):
+    """An environment of Brax's or Playground's shape, without wrappers: no time limit and no reset of its own.
+
+    Its whole state travels as `pipeline_state`; `done` is taken for termination.
+
+    Attributes:
+        inner: the environment; `reset(key)` and `step(state, action)` give states with `obs`, `reward`, `done`.
+    """
+
+    def __init__(self, inner: Any, label: str, name: str, episode_length: int, terminated: TerminationRule | None):
+        """
+        Args:
+            label: for errors, such as `env.id=reacher`.
+
+        Raises:
+            SettingError: its observations are not one vector.
+        """
+        size = inner.observation_size
+        if not isinstance(size, int):
+            raise SettingError(f"{label}: its observations are {size}; only one vector can be learned")
+        self.inner = inner
+        self.spec = EnvSpec(name, size, inner.action_size, episode_length, terminated)
+
+    def reset(self, rng: jax.Array) -> State:
+        return self._shown(self.inner.reset(rng))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        inner: Any = state.pipeline_state
+        with jax.default_matmul_precision("highest"):  # as for the ports: TF32 hurts physics
+            after = self.inner.step(inner, jnp.clip(action, -1.0, 1.0))
+        # Scans and checkpoints need every leaf to keep its type.
+        return self._shown(jax.tree.map(lambda new, old: jnp.asarray(new, jnp.asarray(old).dtype), after, inner))
+
+    def _shown(self, inner: Any) -> State:
+        obs, reward, done = (jnp.asarray(x, jnp.float32) for x in (inner.obs, inner.reward, inner.done))
+        return State(inner, obs, reward, done)
+
+    @property
+    def observation_size(self) -> int:
+        return self.spec.obs_size
+
+    @property
+    def action_size(self) -> int:
+        return self.spec.action_size
+
+    @property
+    def backend(self) -> str:
+        return "mjx"

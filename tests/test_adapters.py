@@ -1,0 +1,161 @@
+"""Tasks that are not of this project: any task of a suite by name, and anybody's own."""
+
+import json
+import shutil
+from pathlib import Path
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from dm_control import suite
+
+from tests.helpers import command
+from vecpsmbpo import config, envs, metrics
+from vecpsmbpo.envs import termination
+from vecpsmbpo.settings import SettingError
+
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+HOSTED = [
+    ("gymnasium", {"id": "Swimmer-v5"}),
+    ("gymnasium", {"id": "Pendulum-v1"}),  # no MuJoCo: its state is on the Python object
+    ("gymnasium", {"id": "Pusher-v5"}),
+    ("dm_control", {"domain": "finger", "task": "turn_easy"}),  # moves its target by changing the model
+    ("dm_control", {"domain": "reacher", "task": "hard"}),
+    ("dm_control", {"domain": "manipulator", "task": "bring_ball"}),  # props and targets in the model, too
+    ("metaworld", {"task": "door-open-v3"}),
+]
+
+
+@pytest.mark.parametrize(("name", "options"), HOSTED, ids=lambda value: str(value))
+def test_any_hosted_task_resumes_exactly(name, options):
+    env, other = (envs.make(name, "host", num_envs=2, seed=seed, **options) for seed in (3, 99))
+    env.episode_length = other.episode_length = 30
+    random = np.random.default_rng(0)
+    env.reset()
+    other.reset()
+    for moment in (17, 29, 30):  # mid-episode, the step before a reset, and its very moment
+        for _ in range(moment):
+            env.step(random.uniform(-1, 1, (2, env.spec.action_size)))
+        np.testing.assert_array_equal(other.load(json.loads(json.dumps(env.save()))), env._obs)
+        for _ in range(40):
+            actions = random.uniform(-1, 1, (2, env.spec.action_size))
+            for ours, theirs in zip(env.step(actions), other.step(actions), strict=True):
+                np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_gymnasium_task_is_the_suite_s_own():
+    env = envs.make("gymnasium", id="Swimmer-v5", seed=7)
+    own = gymnasium.make("Swimmer-v5")
+    np.testing.assert_array_equal(env.reset()[0], own.reset(seed=7)[0].astype(np.float32))
+    for action in np.random.default_rng(0).uniform(-1, 1, (50, 2)):
+        step, (obs, reward, *_) = env.step(action[None]), own.step(action.astype(np.float32))
+        np.testing.assert_array_equal(step.next_obs[0], obs.astype(np.float32))
+        assert step.reward[0] == np.float32(reward)
+    assert (env.spec.obs_size, env.spec.action_size, env.spec.episode_length) == (8, 2, 1000)
+    assert envs.make("gymnasium", id="Reacher-v5").spec.episode_length == 50
+
+
+def test_a_dm_control_task_is_the_suite_s_own():
+    env = envs.make("dm_control", domain="finger", task="spin", seed=7)
+    own = suite.load("finger", "spin", task_kwargs={"random": 7})
+    flat = lambda timestep: np.concatenate([np.ravel(x) for x in timestep.observation.values()])  # noqa: E731
+    np.testing.assert_array_equal(env.reset()[0], flat(own.reset()).astype(np.float32))
+    for action in np.random.default_rng(0).uniform(-1, 1, (50, 2)):
+        step, theirs = env.step(action[None]), own.step(action)
+        np.testing.assert_array_equal(step.next_obs[0], flat(theirs).astype(np.float32))
+        assert step.reward[0] == np.float32(theirs.reward)
+    assert env.spec.episode_length == own._step_limit == 1000
+
+
+@pytest.mark.parametrize(
+    "env_id", [f"{name}-v5" for name, rule in termination.OF_GYMNASIUM.items() if rule is not termination.never]
+)
+def test_known_termination_rules_are_gymnasium_s(env_id):
+    env = envs.make("gymnasium", id=env_id)
+    random, ends = np.random.default_rng(0), 0
+    obs = env.reset()
+    for _ in range(400):
+        action = random.uniform(-1, 1, (1, env.spec.action_size))
+        step = env.step(action)
+        ours = env.spec.terminated(jnp.asarray(obs), jnp.asarray(action), jnp.asarray(step.next_obs))
+        assert bool(ours[0]) == bool(step.terminated[0])
+        ends += int(step.terminated[0])
+        obs = step.obs
+    assert ends > 0
+
+
+def test_of_other_tasks_termination_is_learned():
+    assert envs.make("gymnasium", id="Pendulum-v1").spec.terminated is None
+    assert envs.make("gymnasium", id="Swimmer-v5").spec.terminated is termination.never
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "complaint"),
+    [
+        ("gymnasium", {"id": "CartPole-v1"}, "its actions are Discrete"),
+        ("gymnasium", {"id": "FrozenLake-v1"}, "its observations are Discrete"),
+        ("gymnasium", {"id": "Hoper-v5"}, "env.id=Hoper-v5: "),
+        ("dm_control", {"domain": "fingr", "task": "spin"}, "env.domain=fingr: must be one of acrobot"),
+        ("dm_control", {"domain": "finger", "task": "spn"}, "env.task=spn: must be one of spin"),
+        ("dm_control", {"domain": "lqr", "task": "lqr_2_1"}, "its actions are not bounded"),
+        ("metaworld", {"task": "door"}, "env.task=door: must be one of"),
+        ("brax", {"id": "reachr"}, "env.id=reachr: must be one of"),
+        ("custom", {"make": "nowhere"}, "must be package.module:attribute"),
+        ("custom", {"make": "no_such_module:Task"}, "No module named"),
+        ("custom", {"make": "os:getcwd"}, "gives str, not a brax.envs.base.Env"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused(name, options, complaint):
+    with pytest.raises(SettingError, match=complaint):
+        envs.make(name, **options)
+
+
+class Pictures(gymnasium.Env):
+    """Observations that are images, and parts of observations by name."""
+
+    observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+
+class Parts(Pictures):
+    observation_space = gymnasium.spaces.Dict({"a": gymnasium.spaces.Box(-1, 1, (2,))})
+
+
+@pytest.mark.parametrize("kind", ["Pictures", "Parts"])
+def test_images_and_dictionaries_are_refused(kind):
+    with pytest.raises(SettingError, match=r"only vectors \(Box of one dimension\)"):
+        envs.make("custom", "host", make=f"{__name__}:{kind}")
+
+
+def test_a_brax_task_steps_as_brax_does():
+    env = envs.make("brax", id="reacher")
+    own = env.inner
+    key, action = jax.random.key(0), jnp.array([0.3, -2.0])
+    state, theirs = jax.jit(env.reset)(key), jax.jit(own.reset)(key)
+    np.testing.assert_array_equal(state.obs, theirs.obs)
+    state, theirs = jax.jit(env.step)(state, action), jax.jit(own.step)(theirs, action.clip(-1, 1))
+    np.testing.assert_allclose(state.obs, theirs.obs, rtol=1e-6)
+    assert float(state.reward) == pytest.approx(float(theirs.reward), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("example", "options"),
+    [
+        ("pendulum_mjx:Pendulum", []),
+        ("point_mass_gymnasium:PointMass", ["backend=host"]),
+    ],
+)
+def test_the_examples_train_from_outside_of_the_package(example, options, tmp_path):
+    shutil.copytree(EXAMPLES, tmp_path / "mine")
+    result = command(
+        "train", "env=custom", f"env.make={example}", "size=tiny", *options, "run_dir=run", cwd=tmp_path / "mine"
+    )
+    assert result.returncode == 0, result.stderr
+    settings = config.load(tmp_path / "mine" / "run")
+    assert dict(settings.env_options) == {"make": example}
+    assert len(metrics.read(tmp_path / "mine" / "run" / "metrics.jsonl")) == 3
+    again = command("train", "run_dir=run", "total_steps=160", cwd=tmp_path / "mine")
+    assert again.returncode == 0, again.stderr
+    assert "resuming at step 120" in again.stdout
