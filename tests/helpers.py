@@ -7,13 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
-from vecpsmbpo import config
+from vecpsmbpo import config, metrics
 from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.train import initial_inputs
 from vecpsmbpo.types import EnvSpec, SeedState
+
+METRICS = {
+    "env_steps", "seed", "eval_return", "eval_length", "train_return", "model_loss", "model_val_mse", "critic_loss",
+    "actor_loss", "alpha", "q_mean", "real_ratio", "env_steps_per_s", "updates_per_s", "imagined_per_s",
+    "seconds",
+}  # fmt: skip
+EPISODE = {
+    "seed", "episode", "env_steps", "model", "policy", "return", "length", "terminated", "truncated", "random", "probs",
+}  # fmt: skip
 
 
 def tiny(**changes: Any) -> Settings:
@@ -54,3 +64,20 @@ def argv(*arguments: str, one_thread: bool = False) -> list[str]:
 def environment() -> dict[str, str]:
     """The program's own: without the devices that the tests set up for themselves."""
     return {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+
+
+def check_log(run_dir: Path, settings) -> None:
+    """Every epoch and episode exactly once, with every field."""
+    epochs = metrics.read(run_dir / "metrics.jsonl")
+    seeds = range(settings.seed, settings.seed + settings.num_seeds)
+    steps = range(settings.epoch_steps, settings.total_steps + 1, settings.epoch_steps)
+    assert sorted((line["env_steps"], line["seed"]) for line in epochs) == [(t, s) for t in steps for s in seeds]
+    assert all(set(line) >= METRICS for line in epochs)
+    episodes = metrics.read(run_dir / "episodes.jsonl")
+    for seed in seeds:
+        own = [line for line in episodes if line["seed"] == seed]
+        assert [line["episode"] for line in own] == list(range(1, len(own) + 1))
+        assert all(set(line) == EPISODE for line in own)
+        assert sum(line["length"] for line in own) > settings.total_steps - settings.episode_length
+        assert np.allclose([np.sum(line["probs"]) for line in own], 1.0, atol=1e-5)
+    assert list((run_dir / "tensorboard").iterdir())

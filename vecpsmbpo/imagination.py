@@ -48,6 +48,12 @@ def chunks_per_refresh(settings: Settings, horizon: jax.Array) -> jax.Array:
     return jnp.clip(ring_capacity(settings) // (horizon * chunk), 1, settings.rollout_starts // chunk)
 
 
+def rows_per_refresh(settings: Settings, env_steps: jax.Array) -> jax.Array:
+    """How many transitions one refresh imagines for each member."""
+    now = horizon(settings, env_steps)
+    return chunks_per_refresh(settings, now) * now * chunk_size(settings)
+
+
 def step(
     model: Model, actor: Params, obs: jax.Array, key: jax.Array, *, settings: Settings, spec: EnvSpec
 ) -> Transition:

@@ -2,10 +2,13 @@
 
 import time
 from types import TracebackType
+from typing import NamedTuple
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from vecpsmbpo import imagination
 from vecpsmbpo.settings import Settings
 
 
@@ -64,11 +67,31 @@ class Display:
         def number(value: float | None) -> str:
             return "–" if value is None else f"{value:.4g}"
 
+        rates = self._pace.rates
         return (
             f"return {number(self._train_return)}  eval {number(self._eval_return)}  "
-            f"{self._pace.steps_per_s:.3g} steps/s  {self._pace.updates_per_s:.3g} updates/s  "
+            f"{rates.env_steps:.3g} steps/s  {rates.updates:.3g} updates/s  {rates.imagined:.3g} imagined/s  "
             f"left {self._pace.left(env_steps)}"
         )
+
+
+class Rates(NamedTuple):
+    """Speeds over some steps, of all seeds and members together, per second."""
+
+    env_steps: float
+    updates: float
+    imagined: float
+
+    @classmethod
+    def over(cls, settings: Settings, env_steps: int, steps: int, seconds: float) -> "Rates":
+        """Of the `steps` steps, whole refresh periods, that ended at `env_steps` and took `seconds`."""
+        begun = np.arange(env_steps - steps, env_steps, settings.model_update_every)
+        begun = begun[begun >= settings.warmup_steps]
+        updates = len(begun) * settings.model_update_every * settings.updates_per_step * settings.n_members
+        imagined = 0
+        if settings.real_ratio < 1:
+            imagined = int(np.sum(imagination.rows_per_refresh(settings, begun))) * settings.n_members
+        return cls(*(settings.num_seeds * count / seconds for count in (steps, updates, imagined)))
 
 
 class Pace:
@@ -76,23 +99,14 @@ class Pace:
 
     def __init__(self, settings: Settings):
         self._settings = settings
-        self.steps_per_s = 0.0
-        self.updates_per_s = 0.0
+        self.rates = Rates(0.0, 0.0, 0.0)
         self._learning_step_s: float | None = None  # seconds per step since learning began, smoothed
-        self._warmup_step_s = 0.0
 
     def chunk(self, env_steps: int, steps: int, seconds: float) -> None:
-        settings = self._settings
-        self.steps_per_s = settings.num_seeds * steps / seconds
-        learned = env_steps - steps >= settings.warmup_steps
-        updates = settings.updates_per_step * settings.n_members
-        self.updates_per_s = self.steps_per_s * updates if learned else 0.0
-        pace = seconds / steps
-        if learned:
-            before = self._learning_step_s
-            self._learning_step_s = pace if before is None else 0.7 * before + 0.3 * pace
-        else:
-            self._warmup_step_s = pace
+        self.rates = Rates.over(self._settings, env_steps, steps, seconds)
+        if self.rates.updates:
+            before, now = self._learning_step_s, seconds / steps
+            self._learning_step_s = now if before is None else 0.7 * before + 0.3 * now
 
     def left(self, env_steps: int) -> str:
         """Time left; a dash before learning has begun, since warm-up steps say nothing of what follows."""

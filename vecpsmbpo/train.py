@@ -20,7 +20,7 @@ from vecpsmbpo import checkpoint, config, envs, metrics, resources, runtime
 from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
 from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
 from vecpsmbpo.layout import Layout
-from vecpsmbpo.progress import Display, Stopwatch
+from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Hyper, TrainState
 
@@ -176,16 +176,15 @@ class _Run:
 
     def _lines(self, returns: Returns, seconds: float) -> list[metrics.Line]:
         settings = self.settings
-        steps_per_s = settings.num_seeds * self.epoch_steps_done / seconds
-        learning = self.env_steps - self.epoch_steps_done >= settings.warmup_steps
-        updates_per_s = steps_per_s * settings.updates_per_step * settings.n_members if learning else 0.0
+        rates = Rates.over(settings, self.env_steps, self.epoch_steps_done, seconds)
         return [
             {
                 **line,
                 "eval_return": float(returns.episode_return[index].mean()),
                 "eval_length": float(returns.length[index].mean()),
-                "env_steps_per_s": steps_per_s,
-                "updates_per_s": updates_per_s,
+                "env_steps_per_s": rates.env_steps,
+                "updates_per_s": rates.updates,
+                "imagined_per_s": rates.imagined,
                 "compile_seconds": self.driver.compile_seconds,
                 "seconds": self.watch(),
             }

@@ -218,9 +218,7 @@ class PsMbpo:
 
     def imagined_rows(self, counters: Counters, enabled: jax.Array) -> jax.Array:
         """The counter of `counters` after `imagine`."""
-        horizon = imagination.horizon(self.settings, counters.env_steps)
-        chunks = imagination.chunks_per_refresh(self.settings, horizon)
-        new = jnp.where(enabled, chunks * horizon * imagination.chunk_size(self.settings), 0)
+        new = jnp.where(enabled, imagination.rows_per_refresh(self.settings, counters.env_steps), 0)
         return replay.count(counters.imagined_rows, new, imagination.ring_capacity(self.settings))
 
     # ── learn: every step ────────────────────────────────────────────────────────────────────────────────────

@@ -1,0 +1,209 @@
+"""A run that is killed, stopped, damaged or diverges, and goes on: through the command line and in this process."""
+
+import dataclasses
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.helpers import argv, check_log, command, environment, tiny
+from vecpsmbpo import checkpoint, config, evaluate, metrics, train
+
+SMALL = ["env=cartpole_swingup", "size=tiny", "num_seeds=2", "total_steps=200"]
+
+
+def final_parameters(run_dir: Path) -> list[np.ndarray]:
+    """Every array of the newest checkpoint's state."""
+    settings = config.load(run_dir)
+    driver, saved = evaluate.restore(settings)
+    assert saved.step == settings.total_steps
+    leaves = jax.tree.leaves(driver.layout.unpad(saved.state))
+    is_key = lambda x: jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    return [np.asarray(jax.random.key_data(leaf) if is_key(leaf) else leaf) for leaf in leaves]
+
+
+def without_times(lines: list[dict]) -> list[dict]:
+    """Lines without what depends on the clock."""
+    clock = {"env_steps_per_s", "updates_per_s", "imagined_per_s", "seconds", "compile_seconds"}
+    return [{name: value for name, value in line.items() if name not in clock} for line in lines]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """A run of two seeds on one CPU thread."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    result = command("train", *SMALL, "run_dir=run", cwd=folder, one_thread=True)
+    assert result.returncode == 0, result.stderr
+    return folder / "run"
+
+
+def assert_same_run(run_dir: Path, other: Path) -> None:
+    for ours, theirs in zip(final_parameters(run_dir), final_parameters(other), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    for file in ("metrics.jsonl", "episodes.jsonl"):
+        assert without_times(metrics.read(run_dir / file)) == without_times(metrics.read(other / file))
+    check_log(run_dir, config.load(run_dir))
+
+
+def test_a_run_killed_again_and_again_is_the_undisturbed_run(undisturbed, tmp_path):
+    """kill -9 at random moments, the same command each time."""
+    arguments = argv("train", *SMALL, "run_dir=run", one_thread=True)
+    random = np.random.default_rng(0)
+    kills = 0
+    for _ in range(5):
+        process = subprocess.Popen(arguments, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, text=True)
+        for line in process.stdout:  # compiling takes most of the time: wait for the work to begin
+            if "compiled in" in line:
+                break
+        time.sleep(random.uniform(0.0, 1.5))
+        if process.poll() is None:
+            process.send_signal(signal.SIGKILL)
+            kills += 1
+        process.communicate()
+    result = command("train", *SMALL, "run_dir=run", cwd=tmp_path, one_thread=True)
+    assert result.returncode == 0, result.stderr
+    assert kills >= 4
+    assert_same_run(tmp_path / "run", undisturbed)
+
+
+def test_a_signal_saves_and_says_how_to_go_on(undisturbed, tmp_path):
+    process = subprocess.Popen(
+        argv("train", *SMALL, "run_dir=run", one_thread=True),
+        cwd=tmp_path,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    said = ""
+    for line in process.stdout:
+        said += line
+        if line.startswith("step"):
+            process.send_signal(signal.SIGTERM)
+            break
+    rest, errors = process.communicate(timeout=300)
+    assert process.returncode == 128 + signal.SIGTERM, errors
+    assert "to continue: vecpsmbpo train run_dir=run" in said + rest
+    assert "Traceback" not in errors
+    saved = int(re.search(r"saved at step (\d+) of 200", said + rest).group(1))
+    assert 0 < saved < 200
+    result = command("train", "run_dir=run", cwd=tmp_path, one_thread=True)
+    assert result.returncode == 0, result.stderr
+    assert f"resuming at step {saved}" in result.stdout
+    assert_same_run(tmp_path / "run", undisturbed)
+
+
+def test_a_host_run_resumes_exactly(tmp_path):
+    """The simulator's state is in the checkpoint: 120 steps at once equal 80 and then 40."""
+    common = ["env=hopper", "backend=host", "size=tiny"]
+    for folder, budgets in (("once", [120]), ("twice", [80, 120])):
+        for total in budgets:
+            arguments = ["train", *common, f"run_dir={folder}", f"total_steps={total}"]
+            result = command(*arguments, cwd=tmp_path, one_thread=True)
+            assert result.returncode == 0, result.stderr
+    assert_same_run(tmp_path / "twice", tmp_path / "once")
+
+
+def test_a_finished_run_says_so(undisturbed):
+    result = command("train", "run_dir=run", cwd=undisturbed.parent, one_thread=True)
+    assert result.returncode == 0
+    assert "already complete at 200 steps" in result.stdout
+
+
+def test_evaluation_of_a_run(undisturbed):
+    result = command("eval", "run_dir=run", "episodes=2", "backend=host", cwd=undisturbed.parent)
+    assert result.returncode == 0, result.stderr
+    assert "cartpole_swingup (host) at step 200" in result.stdout
+    assert len(re.findall(r"│ +[01] │ +2 │", result.stdout)) == 2
+
+
+def test_probabilities_can_be_recomputed_from_the_log(undisturbed):
+    settings = config.load(undisturbed)
+    for seed in (0, 1):
+        earned = np.zeros((settings.n_models, settings.n_policies))
+        for line in metrics.read(undisturbed / "episodes.jsonl"):
+            if line["seed"] == seed:
+                logits = (earned - earned.max()) / settings.temperature
+                np.testing.assert_allclose(line["probs"], np.exp(logits) / np.exp(logits).sum(), atol=1e-5)
+                if not line["random"]:
+                    earned[line["model"], line["policy"]] += line["return"]
+
+
+# ── in this process: the loop around the program, with the program's parts damaged ──────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def short_run(tmp_path_factory):
+    """A finished host run of this process, and its settings."""
+    folder = tmp_path_factory.mktemp("short")
+    settings = tiny(env="ball_in_cup", backend="host", run_dir=folder / "run")
+    assert train.train(settings) == 0
+    return settings
+
+
+def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(short_run, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    for file in (folder / "checkpoints" / "120" / "state").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    assert train.train(dataclasses.replace(short_run, run_dir=str(folder))) == 0
+    printed = capsys.readouterr()
+    assert "the checkpoint at step 120 is damaged; taking the one before it" in printed.err
+    assert "resuming at step 80" in printed.out
+    check_log(folder, short_run)
+
+
+def test_divergence_stops_the_run_and_says_where(short_run, tmp_path, monkeypatch):
+    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
+    run = train.HostDriver.run
+
+    def poisoned(self, state, periods):
+        state, news = run(self, state, periods)
+        if int(state.counters.env_steps) == 80:
+            alpha = state.seeds.agents.log_alpha.at[0, 3].set(jnp.nan)
+            state = state.replace(seeds=state.seeds.replace(agents=state.seeds.agents.replace(log_alpha=alpha)))
+        return state, news
+
+    monkeypatch.setattr(train.HostDriver, "run", poisoned)
+    with pytest.raises(
+        train.Diverged, match=r"log_alpha of seed 0, policy n = 1, m = 1, .* last good checkpoint: step 40"
+    ):
+        train.train(settings)
+    checkpoints = checkpoint.Checkpoints(tmp_path / "run" / "checkpoints")
+    assert checkpoints.steps() == [0, 40]
+    checkpoints.close()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small disk needs root")
+def test_a_full_disk_is_one_line_and_keeps_the_last_checkpoint(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], check=False).returncode:
+        pytest.skip("this sandbox does not let root mount")
+    try:
+        result = command("train", "env=ball_in_cup", "backend=host", "size=tiny", f"run_dir={disk}/run", cwd=tmp_path)
+        assert result.returncode == 2, result.stderr
+        expected = f"vecpsmbpo: run_dir={disk}/run: cannot be written (No space left on device)"
+        assert result.stderr.splitlines()[-1] == expected
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_log_files_drop_what_will_be_done_again(tmp_path):
+    lines = [{"env_steps": step, "seed": 0, "return": 1.0, "length": 5} for step in (10, 20, 30)]
+    path = tmp_path / "episodes.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"env_steps": 40, "se')
+    log = metrics.RunLog(tmp_path, env_steps=20)
+    log.episodes([{"env_steps": 25, "seed": 0, "return": 2.0, "length": 5}])
+    log.close()
+    assert [line["env_steps"] for line in metrics.read(path)] == [10, 20, 25]
