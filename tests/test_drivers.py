@@ -29,7 +29,7 @@ def settings_for(**changes):
         "model_hidden_size": 32,
         "model_batch_size": 32,
         "model_max_epochs": 40,
-        "rollout_starts": 100,
+        **({} if changes.get("algo") == "sac" else {"rollout_starts": 100}),
         "model_update_every": 40,
         "policy_hidden_size": 16,
         "policy_batch_size": 32,
@@ -49,10 +49,20 @@ def make_driver(kind, terminates, settings):
     return HostDriver(learner, partial(probes.host, terminates))
 
 
-@pytest.fixture(scope="module", params=[("scan", False), ("scan", True), ("host", False), ("host", True)], ids=str)
+CASES = [
+    ("scan", False, "ops_mbpo"),
+    ("scan", True, "ops_mbpo"),
+    ("scan", True, "mbpo"),
+    ("scan", False, "sac"),
+    ("host", False, "ops_mbpo"),
+    ("host", True, "mbpo"),
+]
+
+
+@pytest.fixture(scope="module", params=CASES, ids=str)
 def trained(request):
-    kind, terminates = request.param
-    settings = settings_for()
+    kind, terminates, algo = request.param
+    settings = settings_for(algo=algo)
     driver = make_driver(kind, terminates, settings)
     state, news = driver.run(driver.init(*initial_inputs(settings)), settings.refreshes_per_epoch)
     return settings, driver, terminates, state, news
@@ -110,7 +120,7 @@ def test_episodes_are_accounted_for(trained):
 
 def test_the_log_alone_gives_the_probabilities_of_equation_19(trained):
     settings, _, _, _, news = trained
-    earned = np.zeros((settings.n_models, settings.n_policies))
+    earned = np.zeros((settings.n_members // settings.n_policies, settings.n_policies))
     for line in metrics.episode_lines(news, 0, settings):
         logits = (earned - earned.max()) / settings.temperature
         np.testing.assert_allclose(line["probs"], np.exp(logits) / np.exp(logits).sum(), atol=1e-5)

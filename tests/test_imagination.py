@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 from tests.helpers import algorithm, initial, tiny
-from vecpsmbpo import imagination, replay
+from vecpsmbpo import replay
 from vecpsmbpo.drivers import over_seeds
 from vecpsmbpo.types import Counters, EnvSpec, Transition
 
@@ -25,8 +26,14 @@ def constant(params, outputs):
 
 @pytest.fixture(scope="module")
 def imagined():
-    """Every model n adds n + 1 to obs[0] and pays n; every policy (n, m) acts near tanh(index / 10); horizon 3."""
-    settings = tiny(n_models=N, n_policies=M, rollout_starts=8, horizon_first=3, horizon_last=3)
+    return imagine(tiny(n_models=N, n_policies=M, rollout_starts=8, horizon_first=3, horizon_last=3))
+
+
+def imagine(settings):
+    """The rows that one refresh adds for every member, and D_E.
+
+    Every model n adds n + 1 to obs[0] and pays n; every policy acts near tanh(index / 10).
+    """
     learner = algorithm(settings, SPEC)
     layout = learner.layout
     specs = layout.specs()
@@ -38,7 +45,7 @@ def imagined():
         return jnp.concatenate([jnp.array([n + 1.0, 0.0, n]), quiet])
 
     outputs = jnp.stack([model_params(n) for n in range(N)])[None]
-    actions = jnp.stack([jnp.array([i / 10, -1e3]) for i in range(N * M)])[None]
+    actions = jnp.stack([jnp.array([i / 10, -1e3]) for i in range(settings.n_members)])[None]
     actor = seeds.agents.actor
     inner = constant({"params": actor["params"]["ReluMLP_0"]}, actions)["params"]
     seeds = seeds.replace(
@@ -56,8 +63,9 @@ def imagined():
     )
     counters = Counters(jnp.int32(ROWS), jnp.int32(0))
     after = run(counters, placed, placed.key)
-    rows = after.imagined[0, : N * M, : 3 * imagination.chunk_size(settings)]
-    assert int(learner.imagined_rows(counters, jnp.bool_(True))) == rows.shape[1] == 24
+    added = settings.horizon_last * settings.rollout_starts
+    rows = after.imagined[0, : settings.n_members, :added]
+    assert int(learner.imagined_rows(counters, jnp.bool_(True))) == added
     return [replay.unpack(member, 2, 1) for member in rows], np.asarray(after.real[0])
 
 
@@ -105,3 +113,13 @@ def test_a_rollout_that_terminates_is_stored_and_begins_again_from_a_real_state(
     np.testing.assert_allclose(data.next_obs[8:16, 0], 6, atol=0.1)
     np.testing.assert_array_equal(data.obs[16:24, 0], 0)
     assert np.isin(data.obs[16:24, 1], np.arange(ROWS)).all()
+
+
+def test_mbpo_draws_a_model_for_every_row():
+    settings = tiny(algo="mbpo", n_models=N, rollout_starts=600)
+    (data,), _ = imagine(settings)  # one policy
+    n = np.round(data.reward).astype(int)
+    assert scipy.stats.chisquare(np.bincount(n, minlength=N)).pvalue > 1e-4
+    # The whole answer is one model's.
+    np.testing.assert_allclose(data.next_obs[:, 0] - data.obs[:, 0], n + 1, atol=0.04)
+    np.testing.assert_allclose(data.reward, n, atol=0.04)

@@ -1,5 +1,8 @@
 """Rolls policies out in models: the rows of D_M^{n,m} (Algorithm 1, lines 9 and 10), and how many there are."""
 
+from collections.abc import Callable
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -60,6 +63,7 @@ def step(
     """One imagined step of one member for a batch of states.
 
     Args:
+        model: the member's own, or with `rollout_models=any` all of them, [N, ...].
         obs: [B, O].
 
     Returns:
@@ -68,8 +72,31 @@ def step(
     action_key, model_key = jax.random.split(key)
     action, _ = sac.make_networks(settings, spec).actor.law(actor, obs).sample(action_key)
     net = dynamics.network(settings, spec)
-    next_obs, reward, terminated = dynamics.predict(model, obs, action, model_key, net=net, spec=spec)
+    predict = partial(dynamics.predict, net=net, spec=spec)
+    if settings.rollout_models == "any":
+        predict = partial(predict_with_any, predict)
+    next_obs, reward, terminated = predict(model, obs, action, model_key)
     return Transition(obs, action, reward, next_obs, terminated)
+
+
+def predict_with_any(
+    predict: Callable[..., dynamics.Successor], models: Model, obs: jax.Array, action: jax.Array, key: jax.Array
+) -> dynamics.Successor:
+    """For every row a model drawn anew, as in MBPO and in TS1 of PETS.
+
+    Every model predicts every row and one answer is kept: what a model costs is little beside the updates, and no row
+    has to be moved.
+
+    Args:
+        predict: of one model.
+        models: leaves [N, ...].
+    """
+    key, which_key = jax.random.split(key)
+    count = models.loss.shape[0]
+    answers = jax.vmap(predict, in_axes=(0, None, None, 0))(models, obs, action, jax.random.split(key, count))
+    rows = jnp.arange(obs.shape[0])
+    which = jax.random.randint(which_key, rows.shape, 0, count)
+    return jax.tree.map(lambda x: x[which, rows], answers)
 
 
 def start_states(real: jax.Array, rows: jax.Array, key: jax.Array, count: int, spec: EnvSpec) -> jax.Array:

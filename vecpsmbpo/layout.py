@@ -33,6 +33,7 @@ class Layout:
         num_seeds: S.
         n_models: N.
         n_policies: M.
+        n_members: N·M, or M where policies do not belong to models.
         sequential: members of one device run one after the other (`lax.map`) instead of batched (`vmap`). On a CPU
             core, whose cache holds one member's parameters but not all of them, this is faster; the arithmetic is the
             same.
@@ -42,13 +43,14 @@ class Layout:
     num_seeds: int
     n_models: int
     n_policies: int
+    n_members: int
     sequential: bool
 
     @classmethod
     def of(cls, settings: Settings) -> "Layout":
         """Uses every device of the process that can be given work, or the first `settings.devices` of them."""
         devices = jax.devices()
-        count = min(settings.devices or len(devices), len(devices), settings.num_seeds * settings.n_members)
+        count = min(settings.devices or len(devices), len(devices), settings.parallel_parts)
         over_seeds = math.gcd(settings.num_seeds, count)
         grid = np.array(devices[:count]).reshape(over_seeds, count // over_seeds)
         return cls(
@@ -56,6 +58,7 @@ class Layout:
             num_seeds=settings.num_seeds,
             n_models=settings.n_models,
             n_policies=settings.n_policies,
+            n_members=settings.n_members,
             sequential=devices[0].platform == "cpu",
         )
 
@@ -65,11 +68,6 @@ class Layout:
     def shards(self) -> int:
         """Devices along the member axis."""
         return self.mesh.shape[MEMBERS]
-
-    @property
-    def n_members(self) -> int:
-        """N·M."""
-        return self.n_models * self.n_policies
 
     @property
     def padded_models(self) -> int:
@@ -108,9 +106,14 @@ class Layout:
 
     def models_of_members(self, models: Any) -> Any:
         """This device's models [N_local, ...] -> for each of its members the model that it learns in [P_local, ...]."""
-        everywhere = jax.tree.map(lambda x: jax.lax.all_gather(x, MEMBERS, tiled=True), models)
         chosen = self.model_of(self.member_ids())
-        return jax.tree.map(lambda x: x[chosen], everywhere)
+        return jax.tree.map(lambda x: _everywhere(x)[chosen], models)
+
+    def all_models_for_members(self, models: Any) -> Any:
+        """This device's models [N_local, ...] -> all N of them for each of its members, [P_local, N, ...]."""
+        members = self.member_ids().shape[0]
+        real = jax.tree.map(lambda x: _everywhere(x)[: self.n_models], models)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), real)
 
     def ask(self, member: jax.Array, tree: Any, function: Callable = lambda params: params) -> Any:
         """`function` of the leaves [...] that `member` has in `tree` [P_local, ...]: computed by every device for one
@@ -188,3 +191,8 @@ class Layout:
                 imagined=resize(seeds.imagined, members),
             )
         )
+
+
+def _everywhere(x: jax.Array) -> jax.Array:
+    """[X_local, ...] -> [X, ...] on every device."""
+    return jax.lax.all_gather(x, MEMBERS, tiled=True)

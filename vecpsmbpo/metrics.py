@@ -100,7 +100,7 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
                 "terminated": terminated,
                 "truncated": not terminated,
                 "random": bool(news.random[step, seed]),
-                "probs": news.probs[step, seed].reshape(settings.n_models, settings.n_policies).tolist(),
+                "probs": news.probs[step, seed].reshape(-1, settings.n_policies).tolist(),
             }
         )
     return lines

@@ -19,7 +19,7 @@ def configure(settings: Settings) -> None:
     where there is a GPU.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    useful = min(settings.devices or cores, cores, settings.num_seeds * settings.n_members)
+    useful = min(settings.devices or cores, cores, settings.parallel_parts)
     flags = os.environ.get("XLA_FLAGS", "")
     if useful > 1 and "xla_cpu_multi_thread_eigen" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {SINGLE_THREADED}".strip()

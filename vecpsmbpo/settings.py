@@ -72,6 +72,7 @@ class Settings:
     horizon_last: int = _whole(1)
     horizon_ramp_start: float = _real(0)
     horizon_ramp_end: float = _real(0)
+    rollout_models: str = _choice("own", "any")
     # policies (A.2)
     n_policies: int = _whole(1)
     policy_hidden_size: int = _whole(1)
@@ -93,8 +94,13 @@ class Settings:
 
     @property
     def n_members(self) -> int:
-        """N·M, the policies that the posterior draws from."""
-        return self.n_models * self.n_policies
+        """The policies that the posterior draws from: N·M, or M where none belongs to a model."""
+        return self.n_policies * (self.n_models if self.rollout_models == "own" else 1)
+
+    @property
+    def parallel_parts(self) -> int:
+        """How many of the run's parts can be spread over devices: its members or its models, whichever are more."""
+        return self.num_seeds * max(self.n_members, self.n_models)
 
     @property
     def refreshes_per_epoch(self) -> int:

@@ -128,7 +128,8 @@ class _Run:
         settings, layout = self.settings, self.driver.layout
         self.display.say(
             f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × "
-            f"N = {settings.n_models} models × M = {settings.n_policies} policies, "
+            f"N = {settings.n_models} models × M = {settings.n_policies} policies"
+            f"{' in all of them' if settings.rollout_models == 'any' else ''}, "
             f"{settings.updates_per_step} updates per step, on {layout.mesh.size} {jax.default_backend()} device(s)"
         )
         self.display.say(f"memory: {self.memory}")

@@ -12,7 +12,6 @@ from vecpsmbpo.envs.host.mujoco_state import MujocoState
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import EnvSpec
 
-
 LARGEST_ACTION = 1e6  # the suite gives actuators without a range one of 1e10
 EPISODE_LENGTH = 1000  # of a task without a limit
 

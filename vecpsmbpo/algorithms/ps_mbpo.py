@@ -1,5 +1,8 @@
 """PS-MBPO and OPS-MBPO (Algorithm 1) for one seed: N models, N·M policies, one of which acts.
 
+MBPO and SAC are settings of it: one policy that learns in all models (`rollout_models=any`), and one that learns from
+real data alone (λ = 1, equation 15). They share every line, so that comparisons differ in the posterior only.
+
 Everything here runs inside `layout.Layout.spread`: models and agents are this device's share, [N_local, ...] and
 [P_local, ...]. `counters` are shared by all seeds.
 """
@@ -188,7 +191,9 @@ class PsMbpo:
         chunk = imagination.chunk_size(settings)
         horizon = imagination.horizon(settings, counters.env_steps)
         chunks = jnp.where(enabled, imagination.chunks_per_refresh(settings, horizon), 0)
-        models, ids = layout.models_of_members(state.models), layout.member_ids()
+        ids = layout.member_ids()
+        shared = settings.rollout_models == "any"
+        models = (layout.all_models_for_members if shared else layout.models_of_members)(state.models)
 
         def real_states(key):
             return imagination.start_states(state.real, counters.env_steps, key, chunk, spec)
