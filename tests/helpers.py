@@ -1,5 +1,6 @@
 """What several tests need: tiny settings, and the algorithm on an environment that is in no registry."""
 
+import json
 import os
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 
 from vecpsmbpo import config, metrics
 from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
+from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.train import initial_inputs
@@ -81,3 +83,22 @@ def check_log(run_dir: Path, settings) -> None:
         assert sum(line["length"] for line in own) > settings.total_steps - settings.episode_length
         assert np.allclose([np.sum(line["probs"]) for line in own], 1.0, atol=1e-5)
     assert list((run_dir / "tensorboard").iterdir())
+
+
+def assert_resumes_exactly(env: HostEnv, other: HostEnv, episode_length: int) -> None:
+    """What `env` saves, `other` loads and goes on from, bit for bit.
+
+    Saved in the middle of an episode, one step before a reset, at it, and after it.
+    """
+    env.episode_length = other.episode_length = episode_length
+    random = np.random.default_rng(0)
+    env.reset()
+    other.reset()
+    for moment in (episode_length // 2, episode_length - 1, episode_length, 7):
+        for _ in range(moment):
+            env.step(random.uniform(-1, 1, (2, env.spec.action_size)))
+        np.testing.assert_array_equal(other.load(json.loads(json.dumps(env.save()))), env._obs)
+        for _ in range(episode_length + 10):
+            actions = random.uniform(-1, 1, (2, env.spec.action_size))
+            for ours, theirs in zip(env.step(actions), other.step(actions), strict=True):
+                np.testing.assert_array_equal(ours, theirs)

@@ -1,6 +1,5 @@
 """Tasks that are not of this project: any task of a suite by name, and anybody's own."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from dm_control import suite
 
-from tests.helpers import command
+from tests.helpers import assert_resumes_exactly, command
 from vecpsmbpo import config, envs, metrics
 from vecpsmbpo.envs import termination
 from vecpsmbpo.settings import SettingError
@@ -31,18 +30,7 @@ HOSTED = [
 @pytest.mark.parametrize(("name", "options"), HOSTED, ids=lambda value: str(value))
 def test_any_hosted_task_resumes_exactly(name, options):
     env, other = (envs.make(name, "host", num_envs=2, seed=seed, **options) for seed in (3, 99))
-    env.episode_length = other.episode_length = 30
-    random = np.random.default_rng(0)
-    env.reset()
-    other.reset()
-    for moment in (17, 29, 30):  # mid-episode, the step before a reset, and its very moment
-        for _ in range(moment):
-            env.step(random.uniform(-1, 1, (2, env.spec.action_size)))
-        np.testing.assert_array_equal(other.load(json.loads(json.dumps(env.save()))), env._obs)
-        for _ in range(40):
-            actions = random.uniform(-1, 1, (2, env.spec.action_size))
-            for ours, theirs in zip(env.step(actions), other.step(actions), strict=True):
-                np.testing.assert_array_equal(ours, theirs)
+    assert_resumes_exactly(env, other, 30)
 
 
 def test_a_gymnasium_task_is_the_suite_s_own():

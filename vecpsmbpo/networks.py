@@ -25,7 +25,7 @@ class Prediction(NamedTuple):
 
     mean: jax.Array
     log_variance: jax.Array
-    logit: jax.Array | None
+    logit: Any
 
 
 class GaussianMLP(nn.Module):

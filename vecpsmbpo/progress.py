@@ -4,6 +4,7 @@ import time
 from types import TracebackType
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -90,7 +91,7 @@ class Rates(NamedTuple):
         updates = len(begun) * settings.model_update_every * settings.updates_per_step * settings.n_members
         imagined = 0
         if settings.real_ratio < 1:
-            imagined = int(np.sum(imagination.rows_per_refresh(settings, begun))) * settings.n_members
+            imagined = int(np.sum(imagination.rows_per_refresh(settings, jnp.asarray(begun)))) * settings.n_members
         return cls(*(settings.num_seeds * count / seconds for count in (steps, updates, imagined)))
 
 

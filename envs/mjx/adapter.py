@@ -4,13 +4,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
+from brax.envs.base import State
 
+from vecpsmbpo.envs.mjx.base import SpecEnv
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import EnvSpec, TerminationRule
 
 
-class Adapter(Env):
+class Adapter(SpecEnv):
     """An environment of Brax's or Playground's shape, without wrappers: no time limit and no reset of its own.
 
     Its whole state travels as `pipeline_state`; `done` is taken for termination.
@@ -46,15 +47,3 @@ class Adapter(Env):
     def _shown(self, inner: Any) -> State:
         obs, reward, done = (jnp.asarray(x, jnp.float32) for x in (inner.obs, inner.reward, inner.done))
         return State(inner, obs, reward, done)
-
-    @property
-    def observation_size(self) -> int:
-        return self.spec.obs_size
-
-    @property
-    def action_size(self) -> int:
-        return self.spec.action_size
-
-    @property
-    def backend(self) -> str:
-        return "mjx"

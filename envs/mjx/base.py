@@ -12,14 +12,30 @@ from vecpsmbpo.envs.mjx.simulator import Physics, Simulator
 from vecpsmbpo.types import EnvSpec
 
 
-class MjxEnv(Env):
+class SpecEnv(Env):
+    """A Brax environment that has an `EnvSpec`."""
+
+    spec: EnvSpec
+
+    @property
+    def observation_size(self) -> int:
+        return self.spec.obs_size
+
+    @property
+    def action_size(self) -> int:
+        return self.spec.action_size
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+
+
+class MjxEnv(SpecEnv):
     """Base of the MJX ports: a subclass gives the model, the reset distribution, observation, reward and spec.
 
     There is no auto-reset and no time limit inside: `step` returns the true successor, `State.done` is termination
     only.
     """
-
-    spec: EnvSpec
 
     def __init__(self, model: mujoco.MjModel, substeps: int):
         """
@@ -46,8 +62,9 @@ class MjxEnv(Env):
         """[], for the control step that led from `before` to `after`."""
 
     def terminated(self, physics: Physics) -> jax.Array:
-        """[] bool. Never, unless a task says otherwise."""
-        return jnp.bool_(False)
+        """[] bool, by the spec's rule on the observation; never where it has none. A task may know better."""
+        obs, rule = self.observe(physics), self.spec.terminated
+        return rule(obs, obs, obs) if rule else jnp.bool_(False)
 
     # the environment
 
@@ -85,15 +102,3 @@ class MjxEnv(Env):
         if self.substeps == 1:
             return substep(0, physics)
         return jax.lax.fori_loop(0, self.substeps, substep, physics)
-
-    @property
-    def observation_size(self) -> int:
-        return self.spec.obs_size
-
-    @property
-    def action_size(self) -> int:
-        return self.spec.action_size
-
-    @property
-    def backend(self) -> str:
-        return "mjx"

@@ -3,33 +3,20 @@
 import jax
 import jax.numpy as jnp
 
-from vecpsmbpo.envs import specs
-from vecpsmbpo.envs.mjx.locomotion import Locomotion
+from vecpsmbpo.envs import specs, termination
+from vecpsmbpo.envs.mjx.locomotion import UprightLocomotion
 from vecpsmbpo.envs.mjx.simulator import Physics
 
-RESET_NOISE = 5e-3
-HEALTHY_REWARD, CONTROL_COST = 1.0, 1e-3
 
-
-class Hopper(Locomotion):
-    """Hop forward without falling: reward 1 + velocity - 0.001 |a|²; ends when unhealthy."""
+class Hopper(UprightLocomotion):
+    """Hop forward without falling."""
 
     spec = specs.get("hopper")
 
     def __init__(self):
         super().__init__("hopper.xml", substeps=4)
 
-    def initial_state(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return self.around_start(key, RESET_NOISE, normal_velocity=False)
-
-    def observe(self, physics: Physics) -> jax.Array:
-        return jnp.concatenate([physics.qpos[1:], jnp.clip(physics.qvel, -10.0, 10.0)])
-
-    def reward(self, before: Physics, action: jax.Array, after: Physics) -> jax.Array:
-        velocity = (after.qpos[0] - before.qpos[0]) / self.dt
-        return HEALTHY_REWARD + velocity - CONTROL_COST * jnp.sum(action**2)
-
     def terminated(self, physics: Physics) -> jax.Array:
         # The original tests the velocities themselves, not the clipped ones that it shows.
         state = jnp.concatenate([physics.qpos[1:], physics.qvel])
-        return self.spec.terminated(state, state, state)
+        return termination.hopper_falls(state, state, state)
