@@ -14,6 +14,9 @@ MISTAKES = [
     (["train", "env=hoper"], "env=hoper: did you mean hopper"),
     (["train", "size=big"], "size=big: one of cpu, paper, tiny"),
     (["train", "algo=ops"], "algo=ops: did you mean ops_mbpo"),
+    (["train", "env=gymnasium"], "env.id: must be given with env=gymnasium"),
+    (["train", "env=hopper", "env.id=3"], "env.id: no such option of env=hopper; it has none"),
+    (["train", "env=dm_control", "env.tsk=spin"], "env.tsk: no such option of env=dm_control; it has env.domain"),
     (["train", "n_modles=3"], "n_modles: no such setting; did you mean n_models"),
     (["train", "n_models=three"], "n_models=three: must be a whole number, at least 1"),
     (["train", "n_models=2.5"], "n_models=2.5: must be a whole number, at least 1"),
@@ -31,6 +34,7 @@ MISTAKES = [
     (["eval"], "run_dir: eval needs run_dir="),
     (["eval", "run_dir=nowhere"], "run_dir=nowhere: holds no config.yaml"),
     (["eval", "run_dir=nowhere", "n_models=2"], "n_models=2: eval takes run_dir="),
+    (["theory", "episodes=many"], "episodes=many: must be"),
     (["envs", "x"], "x: envs takes no arguments"),
     (["trian"], "trian: no such command"),
 ]
@@ -101,30 +105,46 @@ def test_every_setting_has_a_default_and_says_what_it_may_be():
 @pytest.mark.parametrize("env", config.options("env"))
 @pytest.mark.parametrize("size", config.options("size"))
 def test_every_task_composes_at_every_size(env, size):
-    settings = config.compose([f"env={env}", f"size={size}"])
+    needed = [f"env.{name}=x" for name, value in config.env_options(env).items() if value == "???"]
+    settings = config.compose([f"env={env}", f"size={size}", *needed])
     assert (settings.env, settings.size) == (env, size)
+    assert dict(settings.env_options) == {
+        name: "x" if value == "???" else value for name, value in config.env_options(env).items()
+    }
 
 
-def test_table_1():
-    """The paper's columns, read from the paper."""
-    hopper = config.compose(["env=hopper"])
-    assert (hopper.target_entropy, hopper.real_ratio, hopper.temperature) == (-1, 0.05, 15_000)
-    assert (hopper.horizon_first, hopper.horizon_last) == (1, 15)
-    assert (hopper.horizon_ramp_start, hopper.horizon_ramp_end) == (20, 100)
-    ball = config.compose(["env=ball_in_cup"])
-    assert (ball.target_entropy, ball.real_ratio, ball.temperature) == (-0.05, 0.5, 1000)
-    assert ball.model_weight_decay == 5e-5
-    cart = config.compose(["env=cartpole_swingup_sparse"])
-    assert (cart.target_entropy, cart.real_ratio, cart.temperature) == (-0.05, 0.5, 5000)
-    for settings in (hopper, ball, cart):
-        assert settings.episode_length == 1000
-        assert settings.total_steps in (125_000, 150_000, 400_000)
-        assert (settings.n_models, settings.n_policies) == (5, 5)
-        assert (settings.model_hidden_size, settings.model_hidden_layers) == (200, 4)
-        assert (settings.replay_capacity, settings.imagined_capacity) == (10**6, 10**6)
-        assert settings.rollout_starts == 100_000
-        assert (settings.model_batch_size, settings.policy_batch_size) == (256, 256)
-        assert (settings.discount, settings.policy_learning_rate) == (0.99, 3e-4)
+# The paper's columns, read from the paper: episode length, total steps, weight decay, start states, horizon, target
+# entropy, λ, τ.
+TABLE_1 = {
+    "ant": (1000, 300 * 1000, 1e-4, 10**5, (1, 25), -4, 0.05, 50_000),
+    "ball_in_cup": (1000, 150 * 1000, 5e-5, 10**5, (1, 1), -0.05, 0.5, 1000),
+    "cartpole_swingup_sparse": (1000, 400 * 1000, 5e-5, 10**5, (1, 1), -0.05, 0.5, 5000),
+    "halfcheetah": (1000, 300 * 1000, 1e-4, 10**5, (1, 1), -3, 0.05, 15_000),
+    "hopper": (1000, 125 * 1000, 1e-4, 10**5, (1, 15), -1, 0.05, 15_000),
+    "walker2d": (1000, 300 * 1000, 1e-4, 10**5, (1, 1), -3, 0.05, 50_000),
+    "window_open": (250, 600 * 250, 1e-4, 5 * 10**4, (1, 1), -1, 0.5, 5000),
+}
+
+
+@pytest.mark.parametrize("env", TABLE_1)
+def test_table_1(env):
+    settings = config.compose([f"env={env}"])
+    assert TABLE_1[env] == (
+        settings.episode_length,
+        settings.total_steps,
+        settings.model_weight_decay,
+        settings.rollout_starts,
+        (settings.horizon_first, settings.horizon_last),
+        settings.target_entropy,
+        settings.real_ratio,
+        settings.temperature,
+    )
+    assert (settings.horizon_ramp_start, settings.horizon_ramp_end) == (20, 100)
+    assert (settings.n_models, settings.n_policies) == (5, 5)
+    assert (settings.model_hidden_size, settings.model_hidden_layers) == (200, 4)
+    assert (settings.replay_capacity, settings.imagined_capacity) == (10**6, 10**6)
+    assert (settings.model_batch_size, settings.policy_batch_size) == (256, 256)
+    assert (settings.discount, settings.policy_learning_rate) == (0.99, 3e-4)
 
 
 def test_uniform_sampling_is_an_infinite_temperature():

@@ -48,6 +48,25 @@ def test_only_stored_rows_are_drawn(key):
     assert set(np.asarray(indices).tolist()) == set(range(10))
 
 
+def test_the_newest_rows_are_those_last_added(key):
+    """Rows 10 to 15 of 16 in a ring of 8 lie at 2 to 7; of a ring not yet full, at the end of what is there."""
+    draw = lambda added, newest: replay.sample_newest_indices(key, (1000,), jnp.int32(added), 8, jnp.int32(newest))  # noqa: E731
+    assert set(np.asarray(draw(16, 6)).tolist()) == {2, 3, 4, 5, 6, 7}
+    assert set(np.asarray(draw(18, 4)).tolist()) == {0, 1, 6, 7}
+    assert set(np.asarray(draw(5, 3)).tolist()) == {2, 3, 4}
+    assert set(np.asarray(draw(5, 100)).tolist()) == {0, 1, 2, 3, 4}
+
+
+def test_policies_learn_from_one_epoch_of_imagined_data(key):
+    """At horizon 1 of 1 to 4, a quarter of the ring: 2 refreshes of 16 rows."""
+    settings = tiny(n_models=1, n_policies=1, policy_batch_size=500, real_ratio=0, horizon_last=4)
+    learner = algorithm(settings, probes.spec(terminates=False))
+    state = jax.tree.map(lambda x: x[0], initial(learner))
+    ring = jnp.broadcast_to(jnp.arange(128.0)[:, None], state.imagined[0].shape)
+    batches = jax.jit(learner.minibatches)(Counters(jnp.int32(50), jnp.int32(128 + 16)), state, ring, key)
+    assert set(np.unique(batches.reward)) == {*range(16), *range(112, 128)}
+
+
 @pytest.mark.parametrize("real_ratio", [0.0, 0.05, 0.5, 1.0])
 def test_each_row_of_a_minibatch_is_real_with_probability_lambda(key, real_ratio):
     """Footnote 2: per row, not per batch."""

@@ -81,12 +81,12 @@ def driver_of(overrides: list[str]) -> ScanDriver:
     return driver
 
 
-def past_warmup(driver: ScanDriver) -> TrainState:
-    """A state whose next periods learn."""
+def past_warmup(driver: ScanDriver, **hyper: float) -> TrainState:
+    """A state whose next periods learn, with some hyperparameters replaced."""
     settings = driver.settings
-    state, _ = driver.run(
-        driver.init(*initial_inputs(settings)), -(-settings.warmup_steps // settings.model_update_every)
-    )
+    keys, given = initial_inputs(settings)
+    given = given.replace(**{name: jnp.full(settings.num_seeds, value) for name, value in hyper.items()})
+    state, _ = driver.run(driver.init(keys, given), -(-settings.warmup_steps // settings.model_update_every))
     return state
 
 
@@ -110,16 +110,13 @@ def seconds_per_step(driver: ScanDriver, repeats: int) -> float:
 
     The refresh (models, imagination) is measured as a period of the same program in which real data alone is used.
     """
-    settings = driver.settings
-    keys, hyper = initial_inputs(settings)
-    state = driver.init(keys, hyper.replace(real_ratio=jnp.ones_like(hyper.real_ratio)))  # λ = 1: no refresh
-    state, _ = driver.run(state, -(-settings.warmup_steps // settings.model_update_every))
+    state = past_warmup(driver, real_ratio=1.0)  # λ = 1: no refresh
     seconds = []
     for _ in range(repeats):
         began = time.perf_counter()
         state, _ = driver.run(state, 1)
         seconds.append(time.perf_counter() - began)
-    return min(seconds) / settings.model_update_every
+    return min(seconds) / driver.settings.model_update_every
 
 
 def bench_updates() -> dict[str, Any]:

@@ -50,6 +50,14 @@ def sample_indices(key: jax.Array, shape: tuple[int, ...], added: jax.Array, cap
     return jax.random.randint(key, shape, 0, jnp.clip(added, 1, capacity))
 
 
+def sample_newest_indices(
+    key: jax.Array, shape: tuple[int, ...], added: jax.Array, capacity: int, newest: jax.Array
+) -> jax.Array:
+    """As `sample_indices`, of the `newest` rows only."""
+    age = jax.random.randint(key, shape, 0, jnp.clip(jnp.minimum(added, newest), 1, capacity))
+    return (added - 1 - age) % capacity
+
+
 def count(added: jax.Array, new: jax.Array, capacity: int) -> jax.Array:
     """`added + new`, less whole turns of a full ring: position and fullness stay, and int32 never overflows."""
     total = added + new

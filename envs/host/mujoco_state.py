@@ -50,8 +50,8 @@ class MujocoState:
 
     def load(self, saved: dict[str, Any]) -> np.ndarray | None:
         """Puts the simulator where the last control step began; the action of that step is yet to be replayed."""
-        for name in self._fields:
-            getattr(self._model, name)[...] = saved["model"].get(name, getattr(self._built, name))
+        for name, value in saved["model"].items():
+            getattr(self._model, name)[...] = value
         self._before = np.array(saved["before"])
         self._action = None if saved["action"] is None else np.array(saved["action"])
         mujoco.mj_setState(self._model, self._data, self._before, _STATE)

@@ -249,7 +249,10 @@ class PsMbpo:
         shape = (self.settings.updates_per_step, self.settings.policy_batch_size)
         source_key, real_key, imagined_key = jax.random.split(key, 3)
         real_index = replay.sample_indices(real_key, shape, counters.env_steps, state.real.shape[0])
-        imagined_index = replay.sample_indices(imagined_key, shape, counters.imagined_rows, imagined.shape[0])
+        newest = imagination.retained_rows(self.settings, counters.env_steps)
+        imagined_index = replay.sample_newest_indices(
+            imagined_key, shape, counters.imagined_rows, imagined.shape[0], newest
+        )
         from_real = jax.random.uniform(source_key, shape) < state.hyper.real_ratio
         rows = jnp.where(from_real[..., None], state.real[real_index], imagined[imagined_index])
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
