@@ -95,10 +95,12 @@ def seconds_per_update(driver: ScanDriver, state: TrainState, repeats: int) -> f
     steps, specs = 5, driver.layout.specs()
 
     def body(state: TrainState) -> Any:
-        def step(seeds, _):
-            return seeds.replace(agents=over_seeds(driver.algorithm.learn)(state.counters, seeds, seeds.key)), None
+        def step(seeds, index):
+            # A key of its own for every step: with one key XLA would draw all minibatches once, before the loop.
+            keys = jax.vmap(lambda key: jax.random.fold_in(key, index))(seeds.key)
+            return seeds.replace(agents=over_seeds(driver.algorithm.learn)(state.counters, seeds, keys)), None
 
-        return jax.lax.scan(step, state.seeds, None, length=steps)[0].agents
+        return jax.lax.scan(step, state.seeds, jnp.arange(steps))[0].agents
 
     run = driver.layout.spread(body, (specs,), specs.seeds.agents)
     jax.block_until_ready(run(state))

@@ -61,8 +61,7 @@ def rows_per_refresh(settings: Settings, env_steps: jax.Array) -> jax.Array:
 def retained_rows(settings: Settings, env_steps: jax.Array) -> jax.Array:
     """How many of the newest rows policies learn from: those of one epoch of refreshes at the current horizon.
 
-    As both MBPO codebases have it. Older rows come from models fitted on less data and from policies of long ago; with
-    them, hopper stayed at a third of its return.
+    As both MBPO codebases have it: older rows come from models fitted on less data and from policies of long ago.
     """
     rows = rows_per_refresh(settings, env_steps) * settings.refreshes_per_epoch
     return jnp.minimum(rows, ring_capacity(settings))
