@@ -74,7 +74,7 @@ def any_task(*, num_envs: int, seed: int, domain: str, task: str) -> HostEnv:
     Raises:
         SettingError: there is no such task, or its actions are not bounded.
     """
-    simulators = [DmControlSimulator(domain, task, seed + index) for index in range(num_envs)]
+    simulators = _simulators(domain, task, num_envs, seed)
     env = simulators[0].env
     obs_size = sum(int(np.prod(part.shape)) for part in env.observation_spec().values())
     # The suite states its limit in seconds; it has been lifted here, so it is read off a second instance.
@@ -84,9 +84,12 @@ def any_task(*, num_envs: int, seed: int, domain: str, task: str) -> HostEnv:
     return HostEnv(spec, simulators)
 
 
+def _simulators(domain: str, task: str, num_envs: int, seed: int) -> list[DmControlSimulator]:
+    return [DmControlSimulator(domain, task, seed + index) for index in range(num_envs)]
+
+
 def _of_paper(name: str, domain: str, task: str, num_envs: int, seed: int) -> HostEnv:
-    env = any_task(num_envs=num_envs, seed=seed, domain=domain, task=task)
-    return HostEnv(specs.get(name), env.simulators)
+    return HostEnv(specs.get(name), _simulators(domain, task, num_envs, seed))
 
 
 def ball_in_cup(*, num_envs: int, seed: int) -> HostEnv:

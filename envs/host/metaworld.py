@@ -26,9 +26,10 @@ from vecpsmbpo.envs.host.mujoco_state import MujocoState
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import EnvSpec
 
-LAYOUT = 0  # seed of the one layout, for training and evaluation alike
 EPISODE_LENGTH = 500  # Metaworld's own limit
-WINDOW_LAYOUT = 0  # chosen: the window stands 9 mm from the middle of the range that Metaworld draws x from
+# Seed of the one layout, for training and evaluation alike. Chosen: window_open's window then stands 9 mm from the
+# middle of the range that Metaworld draws x from.
+LAYOUT = 0
 WINDOW_THRESHOLD = 0.03  # m; chosen: the paper's "3 units" (C.3) are read as centimetres
 WINDOW_OPEN_REWARD, WINDOW_NOT_OPEN_REWARD = 0.0, -10.0  # C.3
 
@@ -107,7 +108,7 @@ def window_open(*, num_envs: int, seed: int, threshold: float = WINDOW_THRESHOLD
         seed: not used, as nothing in the task is random: every episode starts from the same state.
         threshold: how far from fully open counts as open, in metres; the whole travel is 0.2 m.
     """
-    return HostEnv(specs.get("window_open"), [WindowOpenSimulator(WINDOW_LAYOUT, threshold) for _ in range(num_envs)])
+    return HostEnv(specs.get("window_open"), [WindowOpenSimulator(LAYOUT, threshold) for _ in range(num_envs)])
 
 
 def any_task(*, num_envs: int, seed: int, task: str) -> HostEnv:
