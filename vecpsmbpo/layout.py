@@ -6,8 +6,9 @@ it, and the few values that cross it (the acting policy's action, the models) ar
 cores, one GPU and eight GPUs are the same program on a different mesh.
 """
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -179,10 +180,8 @@ class Layout:
 
         def resize(tree, count):
             # Padding repeats the first entry: any valid numbers do.
-            index = np.arange(count) % jax.tree.leaves(tree)[0].shape[1]
-            if count <= jax.tree.leaves(tree)[0].shape[1]:
-                return jax.tree.map(lambda x: x[:, :count], tree)
-            return jax.tree.map(lambda x: x[:, index], tree)
+            index = lambda x: slice(count) if count <= x.shape[1] else np.arange(count) % x.shape[1]  # noqa: E731
+            return jax.tree.map(lambda x: x[:, index(x)], tree)
 
         return state.replace(
             seeds=seeds.replace(
@@ -191,6 +190,51 @@ class Layout:
                 imagined=resize(seeds.imagined, members),
             )
         )
+
+
+    # rings on the host: gigabytes at the paper's size, which must not be copied to be saved
+
+    def rings_to_host(self, rings: jax.Array, members: int | None = None) -> list[np.ndarray]:
+        """Each ring [C, F] of [S, C, F], or of the first `members` in [S, P, C, F], by itself.
+
+        Views, where the host's memory is the device's.
+        """
+        by_place: dict[tuple[int, ...], np.ndarray] = {}
+        for shard in rings.addressable_shards:
+            part, where = np.asarray(shard.data), shard.index[:-2]
+            for inside, place in zip(np.ndindex(part.shape[:-2]), _places(where, rings.shape), strict=True):
+                by_place[place] = part[inside]
+        return [by_place[place] for place in np.ndindex(self.num_seeds, *([members] if members else []))]
+
+    def rings_from_host(self, saved: list[Any], like: Any, spec: PartitionSpec) -> jax.Array:
+        """The inverse of `rings_to_host`, laid out on the mesh; padding members get empty rings.
+
+        Takes the rings out of `saved` one by one, so that they are never held twice.
+
+        Args:
+            like: shape and type of the result.
+            spec: how it lies on the mesh.
+        """
+        count = [self.num_seeds] if len(like.shape) == 3 else [self.num_seeds, len(saved) // self.num_seeds]
+        number = {place: i for i, place in enumerate(np.ndindex(*count))}
+        sharding = NamedSharding(self.mesh, spec)
+        replicas: dict[tuple[tuple[int, ...], ...], list[Any]] = {}
+        for device, where in sharding.addressable_devices_indices_map(like.shape).items():
+            replicas.setdefault(tuple(_places(where[:-2], like.shape)), []).append(device)
+        parts = []
+        for places, devices in replicas.items():
+            part = np.zeros((len(places), *like.shape[-2:]), like.dtype)
+            for row, place in zip(part, places, strict=True):
+                if place in number:
+                    row[:], saved[number[place]] = saved[number[place]], None
+            part = part.reshape(sharding.shard_shape(like.shape))
+            parts += [jax.device_put(part, device) for device in devices]
+        return jax.make_array_from_single_device_arrays(like.shape, sharding, parts)
+
+
+def _places(where: tuple[slice, ...], shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    """The indices that the slices `where` of an array of this shape hold, in order."""
+    return itertools.product(*(range(*piece.indices(size)) for piece, size in zip(where, shape, strict=False)))
 
 
 def _everywhere(x: jax.Array) -> jax.Array:
