@@ -64,7 +64,7 @@ def trained(request):
     kind, terminates, algo = request.param
     settings = settings_for(algo=algo)
     driver = make_driver(kind, terminates, settings)
-    state, news = driver.run(driver.init(*initial_inputs(settings)), settings.refreshes_per_epoch)
+    state, news = driver.run(driver.init(*initial_inputs(settings)), settings.epoch_steps // settings.stride)
     return settings, driver, terminates, state, news
 
 
@@ -146,10 +146,10 @@ def test_inputs_are_whitened_by_all_the_data(trained):
 
 
 def test_an_epoch_compiles_once_whatever_the_data_size_and_chunks_do_not_matter():
-    """Chunks of 1, 4, 2 and 3 periods: one compilation, and the same run as a chunk of 10."""
+    """Chunks of 1, 8, 4 and 7 strides of half a period: one compilation, and the same run as a chunk of 20."""
     settings = settings_for(updates_per_step=1)
     driver = make_driver("scan", True, settings)
-    whole, _ = driver.run(driver.init(*initial_inputs(settings)), 10)
+    whole, _ = driver.run(driver.init(*initial_inputs(settings)), 20)
     state = driver.init(*initial_inputs(settings))
     compiled: list[str] = []
 
@@ -159,8 +159,8 @@ def test_an_epoch_compiles_once_whatever_the_data_size_and_chunks_do_not_matter(
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        for periods in (1, 4, 2, 3):
-            state, _ = driver.run(state, periods)
+        for strides in (1, 8, 4, 7):
+            state, _ = driver.run(state, strides)
         assert not compiled
         jax.jit(lambda x: x + len(compiled))(jnp.ones(3))
         assert compiled  # the listener does hear compilations
@@ -176,7 +176,7 @@ def test_only_real_data_needs_no_models():
     for ratio, fitted in ((1.0, False), (0.0, True)):
         start = driver.init(keys, hyper.replace(real_ratio=jnp.full(1, ratio)))
         before = jax.tree.map(np.asarray, start.seeds.models.params)
-        state, _ = driver.run(start, driver.settings.refreshes_per_epoch)
+        state, _ = driver.run(start, driver.settings.epoch_steps // driver.settings.stride)
         after = state.seeds.models.params
         same = all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (before, after)), strict=True))
         assert same != fitted
@@ -187,12 +187,12 @@ def test_only_real_data_needs_no_models():
 def test_seeds_differ_and_are_what_they_are_alone():
     settings = settings_for(updates_per_step=1, num_seeds=2)
     driver = make_driver("scan", True, settings)
-    state, news = driver.run(driver.init(*initial_inputs(settings)), 5)
+    state, news = driver.run(driver.init(*initial_inputs(settings)), 200 // settings.stride)
     actions = np.asarray(state.seeds.real[:, :200, 1])
     assert (actions[0] != actions[1]).mean() > 0.9
     alone = dataclasses.replace(settings, num_seeds=1, seed=settings.seed + 1)
     single = make_driver("scan", True, alone)
-    state, _ = single.run(single.init(*initial_inputs(alone)), 5)
+    state, _ = single.run(single.init(*initial_inputs(alone)), 200 // settings.stride)
     # Until learning begins nothing can differ; afterwards rounding does, since the mesh is another.
     np.testing.assert_array_equal(actions[1, :120], state.seeds.real[0, :120, 1])
     np.testing.assert_allclose(actions[1], state.seeds.real[0, :200, 1], atol=0.05)

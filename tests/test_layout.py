@@ -110,3 +110,21 @@ def test_hyperparameters_are_traced():
     keys, hyper = initial_inputs(dataclasses.replace(settings, num_seeds=3))
     assert keys.shape == (3,)
     assert {leaf.shape for leaf in jax.tree.leaves(hyper)} == {(3,)}
+
+
+@pytest.mark.parametrize(("seeds", "models"), [(1, 3), (2, 3)])
+def test_rings_come_back_from_the_host(seeds, models):
+    """Padded members (3 on 2 devices) do not reach the host; seeds on 2 devices are put together again."""
+    settings = tiny(n_models=models, n_policies=1, num_seeds=seeds, devices=2)
+    layout = Layout.of(settings)
+    seeds_state = initial(algorithm(settings, SPEC))
+    for name, members in (("real", None), ("imagined", models)):
+        empty, spec = getattr(seeds_state, name), getattr(layout.specs().seeds, name)
+        values = np.random.default_rng(0).normal(size=empty.shape).astype(np.float32)
+        rings = layout.rings_to_host(jax.device_put(values, empty.sharding), members)
+        expected = values if members is None else values[:, :members]
+        np.testing.assert_array_equal(np.reshape(rings, expected.shape), expected)
+        again = layout.rings_from_host(rings, empty, spec)
+        assert again.sharding == empty.sharding
+        assert rings == [None] * len(rings)
+        np.testing.assert_array_equal(again if members is None else again[:, :members], expected)

@@ -167,8 +167,8 @@ def test_divergence_stops_the_run_and_says_where(short_run, tmp_path, monkeypatc
     settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
     run = train.HostDriver.run
 
-    def poisoned(self, state, periods):
-        state, news = run(self, state, periods)
+    def poisoned(self, state, strides):
+        state, news = run(self, state, strides)
         if int(state.counters.env_steps) == 80:
             alpha = state.seeds.agents.log_alpha.at[0, 3].set(jnp.nan)
             state = state.replace(seeds=state.seeds.replace(agents=state.seeds.agents.replace(log_alpha=alpha)))

@@ -82,11 +82,11 @@ def driver_of(overrides: list[str]) -> ScanDriver:
 
 
 def past_warmup(driver: ScanDriver, **hyper: float) -> TrainState:
-    """A state whose next periods learn, with some hyperparameters replaced."""
+    """A state whose next strides learn, with some hyperparameters replaced."""
     settings = driver.settings
     keys, given = initial_inputs(settings)
     given = given.replace(**{name: jnp.full(settings.num_seeds, value) for name, value in hyper.items()})
-    state, _ = driver.run(driver.init(keys, given), -(-settings.warmup_steps // settings.model_update_every))
+    state, _ = driver.run(driver.init(keys, given), settings.first_learning_step // settings.stride)
     return state
 
 
@@ -116,7 +116,7 @@ def seconds_per_step(driver: ScanDriver, repeats: int) -> float:
     seconds = []
     for _ in range(repeats):
         began = time.perf_counter()
-        state, _ = driver.run(state, 1)
+        state, _ = driver.run(state, driver.settings.model_update_every // driver.settings.stride)
         seconds.append(time.perf_counter() - began)
     return min(seconds) / driver.settings.model_update_every
 

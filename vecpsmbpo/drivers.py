@@ -2,7 +2,8 @@
 
 Both go through the same functions of the algorithm in the same order. A period is `model_update_every` steps: it
 begins with a refresh (models refitted, imagination renewed); then every step acts, observes and learns. A chunk is a
-whole number of periods, decided when the program is called: one compiled program serves chunks of any length.
+number of strides, a few steps each, decided when the program is called: one compiled program serves chunks of any
+length, and how a run is cut into chunks does not change it.
 """
 
 import threading
@@ -48,8 +49,8 @@ class Driver(Protocol):
     def compile(self, state: TrainState) -> None:
         """Builds the programs, so that the first chunk does not have to."""
 
-    def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:
-        """A chunk. The state given is consumed. The news have leaves [periods * model_update_every, S, ...]."""
+    def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
+        """A chunk, of an epoch at most. The state given is consumed. News have leaves [strides * stride, S, ...]."""
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
         """Whole episodes of the evaluation policy, in environments of their own. keys [S]."""
@@ -73,16 +74,19 @@ def over_seeds(function: Callable) -> Callable:
     return batched
 
 
-def begin_period(algorithm: PsMbpo, state: TrainState) -> tuple[TrainState, jax.Array]:
-    """Refreshes models and imagined data, and says whether this period learns: not before the warm-up is over.
+def begin_stride(algorithm: PsMbpo, state: TrainState) -> tuple[TrainState, jax.Array]:
+    """Refreshes models and imagined data where a period begins, and says whether this period learns: not before the
+    warm-up is over.
 
     Where every seed learns from real data alone (λ = 1, equation 15), models are not needed and not
     fitted.
     """
     counters, seeds = state.counters, state.seeds
-    learning = counters.env_steps >= algorithm.settings.warmup_steps
-    imagining = learning & algorithm.layout.any_seed(seeds.hyper.real_ratio < 1)
-    seeds, keys = split_keys(seeds, 2)
+    into_period = counters.env_steps % algorithm.settings.model_update_every
+    learning = counters.env_steps - into_period >= algorithm.settings.warmup_steps
+    imagining = (into_period == 0) & learning & algorithm.layout.any_seed(seeds.hyper.real_ratio < 1)
+    advanced, keys = split_keys(seeds, 2)
+    seeds = seeds.replace(key=jnp.where(into_period == 0, advanced.key, seeds.key))
     seeds = over_seeds(algorithm.begin_epoch)(counters, seeds)
     seeds = over_seeds(lambda c, s, k: algorithm.fit_models(c, s, imagining, k))(counters, seeds, keys[:, 0])
     seeds = over_seeds(lambda c, s, k: algorithm.imagine(c, s, imagining, k))(counters, seeds, keys[:, 1])
@@ -151,9 +155,9 @@ class ScanDriver:
         threading.stack_size(usual)
         self.compile_seconds = time.perf_counter() - began
 
-    def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:
-        state, log = (self._compiled or self._run)(state, jnp.int32(periods))
-        flat = jax.tree.map(lambda x: np.asarray(x)[:periods].reshape(-1, *x.shape[2:]), log)
+    def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
+        state, log = (self._compiled or self._run)(state, jnp.int32(strides))
+        flat = jax.tree.map(lambda x: np.asarray(x)[:strides].reshape(-1, *x.shape[2:]), log)
         return state, flat
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
@@ -175,19 +179,19 @@ class ScanDriver:
             env=jax.vmap(self.env.reset)(split[:, 1]),
         )
 
-    def _run_local(self, state: TrainState, periods: jax.Array) -> tuple[TrainState, EpisodeEnd]:
+    def _run_local(self, state: TrainState, strides: jax.Array) -> tuple[TrainState, EpisodeEnd]:
         settings = self.settings
 
-        def period(index, carry):
+        def stride(index, carry):
             state, log = carry
-            state, learning = begin_period(self.algorithm, state)
+            state, learning = begin_stride(self.algorithm, state)
             step = lambda state, _: self._step(state, learning)  # noqa: E731
-            state, news = jax.lax.scan(step, state, None, length=settings.model_update_every)
+            state, news = jax.lax.scan(step, state, None, length=settings.stride)
             return state, jax.tree.map(lambda all_, new: all_.at[index].set(new), log, news)
 
-        shape = (settings.refreshes_per_epoch, settings.model_update_every, state.env.obs.shape[0])
+        shape = (settings.epoch_steps // settings.stride, settings.stride, state.env.obs.shape[0])
         log = EpisodeEnd.blank(shape, settings.n_members)
-        return jax.lax.fori_loop(0, periods, period, (state, log))
+        return jax.lax.fori_loop(0, strides, stride, (state, log))
 
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
         """One real step of every seed's environment, and what follows it."""
@@ -259,7 +263,7 @@ class HostDriver:
         specs, seeds = self.layout.specs(), self.layout.specs().seeds
         spread = self.layout.spread
         self._init = spread(self._init_local, (_BY_SEED, _BY_SEED, _BY_SEED), specs)
-        self._begin = spread(lambda state: begin_period(algorithm, state), (specs,), (specs, _SHARED), donate_argnums=0)
+        self._begin = spread(lambda state: begin_stride(algorithm, state), (specs,), (specs, _SHARED), donate_argnums=0)
         self._act = spread(self._act_local, (seeds, _BY_SEED), (_BY_SEED, _BY_SEED))
         self._observe = spread(
             self._observe_local,
@@ -278,11 +282,11 @@ class HostDriver:
     def compile(self, state: TrainState) -> None:
         pass  # each function is compiled when it is first needed
 
-    def run(self, state: TrainState, periods: int) -> tuple[TrainState, EpisodeEnd]:
+    def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
         news = []
-        for _ in range(periods):
+        for _ in range(strides):
             state, learning = self._begin(state)
-            for _ in range(self.settings.model_update_every):
+            for _ in range(self.settings.stride):
                 state, end = self._step(state, learning)
                 news.append(end)
         return state, jax.tree.map(lambda *xs: np.stack(xs), *news)

@@ -157,7 +157,6 @@ def fit(
     whitening: tuple[jax.Array, jax.Array],
     hyper: Hyper,
     key: jax.Array,
-    max_epochs: jax.Array,
     *,
     settings: Settings,
     spec: EnvSpec,
@@ -170,7 +169,6 @@ def fit(
         real: D_E, [C, F].
         split: which of its rows train and which validate.
         whitening: mean and standard deviation of the inputs, [O + A] each.
-        max_epochs: [] int; 0 returns the model unchanged, apart from its whitening.
     """
     net, block = network(settings, spec), settings.validation_block
     model = model.replace(input_mean=whitening[0], input_std=whitening[1])
@@ -209,7 +207,7 @@ def fit(
 
     def unfinished(carry):
         *_, stale, count, _ = carry
-        return (stale < settings.model_patience) & (count < max_epochs)
+        return (stale < settings.model_patience) & (count < settings.model_max_epochs)
 
     start = (model.params, model.optimizer, model.params, validate(model.params), 0, 0, model.loss)
     _, optimizer, params, best, _, _, train_loss = jax.lax.while_loop(unfinished, epoch, start)

@@ -191,7 +191,6 @@ class Layout:
             )
         )
 
-
     # rings on the host: gigabytes at the paper's size, which must not be copied to be saved
 
     def rings_to_host(self, rings: jax.Array, members: int | None = None) -> list[np.ndarray]:

@@ -1,6 +1,7 @@
 """What a person sees of a run: a live line in a terminal, plain lines elsewhere."""
 
 import time
+from collections import deque
 from types import TracebackType
 from typing import NamedTuple
 
@@ -11,6 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from vecpsmbpo import imagination
 from vecpsmbpo.settings import Settings
+
+PLAIN_LINE_EVERY_S = 30.0  # where there is no terminal, besides the one at the end of each epoch
 
 
 class Display:
@@ -23,6 +26,7 @@ class Display:
         self._train_return: float | None = None
         self._pace = Pace(settings)
         self._live = self._console.is_terminal
+        self._printed = -PLAIN_LINE_EVERY_S
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
@@ -53,16 +57,20 @@ class Display:
             self._train_return = sum(returns) / len(returns)
         line = self._line(env_steps)
         self._progress.update(self._task, completed=env_steps, news=line)
-        if not self._live and env_steps % self._settings.epoch_steps:
-            self.say(f"step {env_steps:>7} / {self._settings.total_steps}  {line}")
+        if env_steps % self._settings.epoch_steps and time.perf_counter() - self._printed > PLAIN_LINE_EVERY_S:
+            self._plain(env_steps, line)
 
     def epoch(self, env_steps: int, eval_return: float) -> None:
         """An epoch ended and was evaluated; mean over seeds."""
         self._eval_return = eval_return
         line = self._line(env_steps)
         self._progress.update(self._task, completed=env_steps, news=line)
+        self._plain(env_steps, line)
+
+    def _plain(self, env_steps: int, line: str) -> None:
         if not self._live:
             self.say(f"step {env_steps:>7} / {self._settings.total_steps}  {line}")
+            self._printed = time.perf_counter()
 
     def _line(self, env_steps: int) -> str:
         def number(value: float | None) -> str:
@@ -85,35 +93,41 @@ class Rates(NamedTuple):
 
     @classmethod
     def over(cls, settings: Settings, env_steps: int, steps: int, seconds: float) -> "Rates":
-        """Of the `steps` steps, whole refresh periods, that ended at `env_steps` and took `seconds`."""
-        begun = np.arange(env_steps - steps, env_steps, settings.model_update_every)
-        begun = begun[begun >= settings.warmup_steps]
-        updates = len(begun) * settings.model_update_every * settings.updates_per_step * settings.n_members
+        """Of the `steps` steps that ended at `env_steps` and took `seconds`."""
+        learning = np.arange(max(env_steps - steps, settings.first_learning_step), env_steps)
+        updates = len(learning) * settings.updates_per_step * settings.n_members
         imagined = 0
         if settings.real_ratio < 1:
-            imagined = int(np.sum(imagination.rows_per_refresh(settings, jnp.asarray(begun)))) * settings.n_members
+            refreshes = jnp.asarray(learning[learning % settings.model_update_every == 0])
+            imagined = int(np.sum(imagination.rows_per_refresh(settings, refreshes))) * settings.n_members
         return cls(*(settings.num_seeds * count / seconds for count in (steps, updates, imagined)))
 
 
 class Pace:
-    """Speeds of the last chunk, and what they say of the time left."""
+    """Speeds over the last refresh period, or longer chunk, and what they say of the time left."""
 
     def __init__(self, settings: Settings):
         self._settings = settings
+        self._chunks: deque[tuple[int, float]] = deque()  # steps and seconds of each, all of one kind
+        self._learning = False
         self.rates = Rates(0.0, 0.0, 0.0)
-        self._learning_step_s: float | None = None  # seconds per step since learning began, smoothed
 
     def chunk(self, env_steps: int, steps: int, seconds: float) -> None:
-        self.rates = Rates.over(self._settings, env_steps, steps, seconds)
-        if self.rates.updates:
-            before, now = self._learning_step_s, seconds / steps
-            self._learning_step_s = now if before is None else 0.7 * before + 0.3 * now
+        learning = env_steps > self._settings.first_learning_step
+        if learning != self._learning:
+            self._chunks.clear()
+        self._learning = learning
+        self._chunks.append((steps, seconds))
+        # A whole period, since its refresh may take as long as the rest of it.
+        while sum(steps for steps, _ in self._chunks) - self._chunks[0][0] >= self._settings.model_update_every:
+            self._chunks.popleft()
+        self.rates = Rates.over(self._settings, env_steps, *map(sum, zip(*self._chunks, strict=True)))
 
     def left(self, env_steps: int) -> str:
         """Time left; a dash before learning has begun, since warm-up steps say nothing of what follows."""
-        if self._learning_step_s is None:
+        if not self._learning:
             return "–"
-        return duration((self._settings.total_steps - env_steps) * self._learning_step_s)
+        return duration((self._settings.total_steps - env_steps) / self.rates.env_steps * self._settings.num_seeds)
 
 
 def duration(seconds: float) -> str:

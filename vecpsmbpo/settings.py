@@ -107,6 +107,16 @@ class Settings:
         return self.epoch_steps // self.model_update_every
 
     @property
+    def stride(self) -> int:
+        """Steps after which the host may look at the run, and stop it: the largest divisor of a period up to 25."""
+        return max(steps for steps in range(1, 26) if self.model_update_every % steps == 0)
+
+    @property
+    def first_learning_step(self) -> int:
+        """The first multiple of a period at which the warm-up is over."""
+        return -(-self.warmup_steps // self.model_update_every) * self.model_update_every
+
+    @property
     def validation_block(self) -> int:
         """k, when one row in k validates: the split draws one row of every k consecutive ones."""
         return round(1 / self.validation_ratio)

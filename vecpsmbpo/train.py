@@ -24,7 +24,8 @@ from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Hyper, TrainState
 
-LONG_EPOCH_S = 20.0  # an epoch that takes longer is run period by period, to show progress and to heed signals
+# An epoch that takes longer than this is run in chunks of about half of it, to show progress and to heed signals.
+LONG_EPOCH_S = 20.0
 
 
 class DiskError(Exception):
@@ -103,7 +104,7 @@ class _Run:
         self.memory = memory
         self.epoch_began = time.perf_counter()
         self.epoch_steps_done = 0
-        self.epoch_estimate = float("inf")
+        self.stride_s = float("inf")  # seconds per stride in the last chunk; infinite: not known
 
     def go(self, stop: "_Stop") -> int:
         settings = self.settings
@@ -142,19 +143,17 @@ class _Run:
         self.display.say(f"compiled in {self.driver.compile_seconds:.1f} s")
 
     def _chunk(self) -> None:
-        """Runs to the end of the epoch, or one period of a long one, and writes down what happened."""
+        """Runs to the end of the epoch, or a part of a long one, and writes down what happened."""
         settings = self.settings
         into_epoch = self.env_steps % settings.epoch_steps
         if into_epoch == 0:
             self.epoch_began, self.epoch_steps_done = time.perf_counter(), 0
-        periods = (settings.epoch_steps - into_epoch) // settings.model_update_every
-        if self.epoch_estimate > LONG_EPOCH_S:
-            periods = 1
+        strides = self._strides(settings.epoch_steps - into_epoch)
         began = time.perf_counter()
-        self.state, news = self.driver.run(self.state, periods)
+        self.state, news = self.driver.run(self.state, strides)
         seconds = time.perf_counter() - began
-        steps = periods * settings.model_update_every
-        self.epoch_estimate = seconds / steps * settings.epoch_steps
+        self.stride_s = seconds / strides
+        steps = strides * settings.stride
         before, self.env_steps = self.env_steps, self.env_steps + steps
         self.epoch_steps_done += steps
         self._check_finite(before)
@@ -163,6 +162,17 @@ class _Run:
         self.display.chunk(self.env_steps, steps, seconds, [line["return"] for line in episodes])
         if self.env_steps % settings.epoch_steps == 0:
             self._end_epoch()
+
+    def _strides(self, left: int) -> int:
+        """How many the next chunk has, `left` steps before the end of the epoch."""
+        settings = self.settings
+        until_learning = settings.first_learning_step - self.env_steps
+        if 0 < until_learning < left:
+            left = until_learning
+        if until_learning == 0:
+            self.stride_s = float("inf")  # learning may take a thousand times as long as the steps before it
+        strides = left // settings.stride
+        return strides if strides * self.stride_s <= LONG_EPOCH_S else max(1, int(LONG_EPOCH_S / 2 / self.stride_s))
 
     def _end_epoch(self) -> None:
         settings = self.settings

@@ -157,29 +157,22 @@ class PsMbpo:
         )
 
     def fit_models(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
-        """Refits every model on D_E (Algorithm 1, line 2); zero epochs where not `enabled`."""
+        """Refits every model on D_E (Algorithm 1, line 2) where `enabled`."""
         settings, spec = self.settings, self.spec
         split_key, fit_key = jax.random.split(key)
         rows = counters.env_steps
         split = dynamics.Split.draw(split_key, rows, settings.replay_capacity, settings.validation_block)
         whitening = dynamics.scaling(state.moments, rows)
-        epochs = jnp.where(enabled, settings.model_max_epochs, 0)
 
         def fit(model, key):
-            return dynamics.fit(
-                model,
-                state.real,
-                split,
-                whitening,
-                state.hyper,
-                key,
-                epochs,
-                settings=settings,
-                spec=spec,
-            )
+            return dynamics.fit(model, state.real, split, whitening, state.hyper, key, settings=settings, spec=spec)
 
         keys = self.layout.keys(fit_key, self.layout.model_ids())
-        return state.replace(models=self.layout.map_local(fit, state.models, keys))
+        # Only the models go through the branch: see `drivers.observe_and_learn`.
+        fitted = jax.lax.cond(
+            enabled, lambda models: self.layout.map_local(fit, models, keys), lambda x: x, state.models
+        )
+        return state.replace(models=fitted)
 
     def imagine(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Rolls every member (n, m) out in model n from real states (lines 9 and 10), into its own ring.
