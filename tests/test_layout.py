@@ -128,3 +128,14 @@ def test_rings_come_back_from_the_host(seeds, models):
         assert again.sharding == empty.sharding
         assert rings == [None] * len(rings)
         np.testing.assert_array_equal(again if members is None else again[:, :members], expected)
+
+
+def test_saving_rings_leaves_them_to_be_overwritten_in_place():
+    """A view that outlived the save would make the next donated call copy gigabytes."""
+    layout = Layout.of(tiny(devices=2))
+    ring = initial(algorithm(tiny(devices=2), SPEC)).imagined
+    shards = lambda x: [shard.data.unsafe_buffer_pointer() for shard in x.addressable_shards]  # noqa: E731
+    before = shards(ring)
+    assert len(layout.rings_to_host(ring, 4)) == 4
+    after = jax.jit(lambda x: x.at[..., 0].set(1.0), donate_argnums=0, out_shardings=ring.sharding)(ring)
+    assert shards(after) == before

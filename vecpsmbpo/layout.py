@@ -200,8 +200,8 @@ class Layout:
         """
         by_place: dict[tuple[int, ...], np.ndarray] = {}
         for shard in rings.addressable_shards:
-            part, where = np.asarray(shard.data), shard.index[:-2]
-            for inside, place in zip(np.ndindex(part.shape[:-2]), _places(where, rings.shape), strict=True):
+            part = _view(shard.data)
+            for inside, place in zip(np.ndindex(part.shape[:-2]), _places(shard.index[:-2], rings.shape), strict=True):
                 by_place[place] = part[inside]
         return [by_place[place] for place in np.ndindex(self.num_seeds, *([members] if members else []))]
 
@@ -229,6 +229,15 @@ class Layout:
             part = part.reshape(sharding.shard_shape(like.shape))
             parts += [jax.device_put(part, device) for device in devices]
         return jax.make_array_from_single_device_arrays(like.shape, sharding, parts)
+
+
+def _view(x: jax.Array) -> np.ndarray:
+    """`x` on the host, and not copied if it is there already.
+
+    `np.asarray` would not copy either, but jax keeps its view as long as `x` lives: a program that is then given `x`
+    to overwrite copies it first.
+    """
+    return np.from_dlpack(x) if x.device.platform == "cpu" else np.asarray(x)
 
 
 def _places(where: tuple[slice, ...], shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:

@@ -16,6 +16,7 @@ from vecpsmbpo.types import EnvSpec, TrainState
 
 GIB = 2**30
 CHECKPOINT_OVERHEAD = 2**20  # orbax's own files
+PROGRAM_BYTES = 2 * GIB  # Python, JAX and XLA while it compiles (measured: 0.5 and 1.4 GiB)
 
 
 def state_bytes(layout: Layout, shapes: Any) -> int:
@@ -37,7 +38,7 @@ def working_bytes(settings: Settings, spec: EnvSpec, layout: Layout) -> int:
     minibatches = 3 * settings.updates_per_step * settings.policy_batch_size * row
     rollout = imagination.chunk_size(settings) * (2 * row + 8 * settings.model_hidden_size)
     working = members * max(minibatches, rollout)
-    if layout.mesh.devices.flat[0].platform != "cpu":
+    if not _on_cpu(layout):
         return working
     rings = members * imagination.ring_capacity(settings) * row
     return max(working, rings // layout.mesh.size)
@@ -45,11 +46,14 @@ def working_bytes(settings: Settings, spec: EnvSpec, layout: Layout) -> int:
 
 def available_bytes(layout: Layout) -> int:
     """Free memory for the mesh: of the GPUs, or of this machine (and its control group)."""
-    devices = layout.mesh.devices.ravel()
-    if devices[0].platform != "cpu":
-        stats = [device.memory_stats() or {} for device in devices]
+    if not _on_cpu(layout):
+        stats = [device.memory_stats() or {} for device in layout.mesh.devices.ravel()]
         return sum(s.get("bytes_limit", 0) - s.get("bytes_in_use", 0) for s in stats)
     return min(_machine_available(), _control_group_available())
+
+
+def _on_cpu(layout: Layout) -> bool:
+    return layout.mesh.devices.flat[0].platform == "cpu"
 
 
 def _machine_available() -> int:
@@ -76,9 +80,12 @@ def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any)
         SettingError: it does not fit.
     """
     state, working = state_bytes(layout, shapes), working_bytes(settings, spec, layout)
+    program = PROGRAM_BYTES if _on_cpu(layout) else 0
     free = available_bytes(layout)
     words = f"{state / GIB:.2f} GiB of buffers and networks, {working / GIB:.2f} GiB at work"
-    if state + working > free:
+    if program:
+        words += f", up to {program / GIB:.0f} GiB for the program itself"
+    if state + working + program > free:
         raise SettingError(
             f"not enough memory: {words}, but {free / GIB:.2f} GiB are free; lower imagined_capacity, "
             "replay_capacity, n_models, n_policies or num_seeds"
