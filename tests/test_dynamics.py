@@ -53,7 +53,7 @@ def fit(linear):
 
 def test_fit_learns_the_mean_and_the_noise(linear, fit, key):
     settings, _ = linear
-    model = dynamics.init(key, settings, SPEC)
+    model = dynamics.init(key, Hyper.of(settings), settings, SPEC)
     fitted = fit(model, jnp.int32(CAPACITY), key)
     obs, action = jnp.array([[0.5, -0.5]]), jnp.array([[1.0]])
     mean, log_variance, _ = dynamics.forward(fitted, obs, action, net=dynamics.network(settings, SPEC))
@@ -65,7 +65,7 @@ def test_fit_learns_the_mean_and_the_noise(linear, fit, key):
 
 def test_a_data_set_that_grows_needs_no_new_program(linear, fit, key):
     settings, _ = linear
-    model = dynamics.init(key, settings, SPEC)
+    model = dynamics.init(key, Hyper.of(settings), settings, SPEC)
     for rows in (5, 64, 777, CAPACITY):
         model = fit(model, jnp.int32(rows), key)
     assert fit._cache_size() == 1
@@ -75,7 +75,7 @@ def test_a_data_set_that_grows_needs_no_new_program(linear, fit, key):
 def test_the_best_parameters_are_restored(linear, fit, key):
     """Under a learning rate that destroys the model, the fit must hand back what it started from."""
     settings, rows = linear
-    model = fit(dynamics.init(key, settings, SPEC), jnp.int32(CAPACITY), key)
+    model = fit(dynamics.init(key, Hyper.of(settings), settings, SPEC), jnp.int32(CAPACITY), key)
     split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
     hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(1.0))
     whitening = (model.input_mean, model.input_std)
@@ -119,7 +119,7 @@ def test_where_the_rule_is_not_known_termination_is_learned(linear, key):
     def run(key):
         split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
         whitening = jnp.zeros(3), jnp.ones(3)
-        model = dynamics.init(key, settings, spec)
+        model = dynamics.init(key, Hyper.of(settings), settings, spec)
         hyper = Hyper.of(settings)
         return dynamics.fit(model, rows, split, whitening, hyper, key, settings=settings, spec=spec)
 

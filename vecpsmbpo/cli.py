@@ -92,7 +92,7 @@ def _multirun(overrides: list[str]) -> int:
         if status:
             sys.exit(status)
 
-    sys.argv = ["vecpsmbpo", "--multirun", *overrides]
+    sys.argv = ["vecpsmbpo", "--multirun", *config.for_hydra(overrides)]
     hydra.main(version_base="1.3", config_path="pkg://vecpsmbpo.configs", config_name="config")(task)()
     return 0
 

@@ -17,10 +17,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from vecpsmbpo.envs import registry
-from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, build, check
+from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, build, check, check_sweep
 
 CONFIG_FILE = "config.yaml"
 GROUPS = ("env", "algo", "size")
+_DOTTED = {"env": "env_options", "sweep": "sweep"}  # where the settings `env.*` and `sweep.*` are kept
 # What the name of a default run directory already says, or need not say.
 _UNNAMED = frozenset({*GROUPS, "seed", "run_dir", *CHANGEABLE})
 
@@ -106,6 +107,8 @@ def _check_override(name: str, value: Any) -> Any:
         return value
     if name.startswith("env."):
         return value
+    if name.startswith("sweep."):
+        return check_sweep(name.removeprefix("sweep."), value)
     if name not in FIELDS:
         raise SettingError(f"{name}: no such setting; {closest(name, FIELDS)}")
     return check(name, "" if value is None and FIELDS[name].type is str else value)
@@ -124,15 +127,21 @@ def compose(overrides: Sequence[str]):
     parse(overrides)
     try:
         with hydra.initialize_config_module("vecpsmbpo.configs", version_base="1.3"):
-            tree = hydra.compose("config", list(overrides))
+            tree = hydra.compose("config", for_hydra(overrides))
     except (HydraException, OmegaConfBaseException) as error:
         raise SettingError(_first_line(error)) from None
     return from_tree(tree, overrides)
 
 
+def for_hydra(overrides: Iterable[str]) -> list[str]:
+    """The same for Hydra, which adds a name to a group, as `sweep.*` needs, only where it is told to."""
+    return [f"++{text}" if text.startswith("sweep.") else text for text in overrides]
+
+
 def from_tree(tree: DictConfig, overrides: Sequence[str]):
     """Settings from what Hydra composed, with the backend and the run directory resolved."""
     values: Any = OmegaConf.to_container(tree, resolve=True)
+    values["sweep"] = values["sweep"] or {}
     values["env_options"] = {name: value for name, value in values["env"].items() if name != "name"}
     for group in GROUPS:
         values[group] = values[group]["name"]
@@ -159,7 +168,10 @@ def _default_run_dir(settings, overrides: Sequence[str]) -> str:
 
 def save(settings, run_dir: Path) -> None:
     """Writes `config.yaml`."""
-    values = {**dataclasses.asdict(settings), "env_options": dict(settings.env_options)}
+    values: dict[str, Any] = dataclasses.asdict(settings)
+    values["env_options"] = dict(settings.env_options)
+    values["sweep"] = {name: list(swept) for name, swept in settings.sweep}
+    values["real_ratio_arms"] = list(settings.real_ratio_arms)
     text = yaml.safe_dump(values, sort_keys=False)
     (run_dir / CONFIG_FILE).write_text(text)
 
@@ -201,10 +213,11 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None):
     stored = load(run_dir)
     changed = {}
     for name, value in given.items():
-        had = dict(stored.env_options).get(name.removeprefix("env.")) if "." in name else getattr(stored, name)
+        group, _, option = name.rpartition(".")
+        had = dict(getattr(stored, _DOTTED[group])).get(option) if group else getattr(stored, name)
         if name == "run_dir" or value == had or (name, value) == ("backend", "auto"):
             continue
-        if name not in CHANGEABLE:
+        if name not in CHANGEABLE or (name == "total_steps" and stored.real_ratio_schedule != "constant"):
             raise SettingError(
                 f"{name}={value}: contradicts the run in {run_dir}, which has {name}={had}; "
                 "leave it out to resume, or give another run_dir"

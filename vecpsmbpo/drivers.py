@@ -84,10 +84,11 @@ def begin_stride(algorithm: PsMbpo, state: TrainState) -> tuple[TrainState, jax.
     counters, seeds = state.counters, state.seeds
     into_period = counters.env_steps % algorithm.settings.model_update_every
     learning = counters.env_steps - into_period >= algorithm.settings.warmup_steps
-    imagining = (into_period == 0) & learning & algorithm.layout.any_seed(seeds.hyper.real_ratio < 1)
-    advanced, keys = split_keys(seeds, 2)
+    advanced, keys = split_keys(seeds, 3)
     seeds = seeds.replace(key=jnp.where(into_period == 0, advanced.key, seeds.key))
-    seeds = over_seeds(algorithm.begin_epoch)(counters, seeds)
+    seeds = over_seeds(algorithm.begin_epoch)(counters, seeds, keys[:, 2])
+    only_real = over_seeds(algorithm.real_ratio)(counters, seeds) >= 1
+    imagining = (into_period == 0) & learning & algorithm.layout.any_seed(~only_real)
     seeds = over_seeds(lambda c, s, k: algorithm.fit_models(c, s, imagining, k))(counters, seeds, keys[:, 0])
     seeds = over_seeds(lambda c, s, k: algorithm.imagine(c, s, imagining, k))(counters, seeds, keys[:, 1])
     counters = counters._replace(imagined_rows=algorithm.imagined_rows(counters, imagining))
@@ -258,7 +259,7 @@ class HostDriver:
         self.layout = algorithm.layout
         self.compile_seconds = 0.0
         self._make_env = make_env
-        self._env = make_env(num_envs=self.settings.num_seeds, seed=self.settings.seed)
+        self._env = make_env(num_envs=self.layout.num_seeds, seed=self.settings.seed)
         self._env.episode_length = self.settings.episode_length
         specs, seeds = self.layout.specs(), self.layout.specs().seeds
         spread = self.layout.spread
@@ -301,7 +302,7 @@ class HostDriver:
         return state, jax.tree.map(np.asarray, end)
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
-        seeds, obs_size = self.settings.num_seeds, self.algorithm.spec.obs_size
+        seeds, obs_size = self.layout.num_seeds, self.algorithm.spec.obs_size
         split = _split(keys, episodes)
         policy = self._policy(state.seeds, split[:, 0])
         env_seed = int(jax.random.randint(split[0, 1], (), 0, 2**30))

@@ -9,7 +9,7 @@ import optax
 
 from vecpsmbpo import networks, optim, replay
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import EnvSpec, Hyper, Model, Moments, Params, Transition
+from vecpsmbpo.types import EnvSpec, Hyper, Model, Moments, Params, Prior, Transition
 
 VALIDATION_BATCH = 512
 
@@ -58,11 +58,14 @@ def network(settings: Settings, spec: EnvSpec) -> networks.GaussianMLP:
     )
 
 
-def init(key: jax.Array, settings: Settings, spec: EnvSpec) -> Model:
+def init(key: jax.Array, hyper: Hyper, settings: Settings, spec: EnvSpec) -> Model:
     size = spec.obs_size + spec.action_size
-    params = network(settings, spec).init(key, jnp.zeros(size))
-    zero = jnp.zeros(())
-    return Model(params, optim.init(params), jnp.zeros(size), jnp.ones(size), loss=zero, val_mse=zero)
+    net, zero = network(settings, spec), jnp.zeros(())
+    params = net.init(key, jnp.zeros(size))
+    prior = None
+    if settings.has_prior:
+        prior = Prior(net.init(jax.random.fold_in(key, 1), jnp.zeros(size)), hyper.prior_scale)
+    return Model(params, optim.init(params), jnp.zeros(size), jnp.ones(size), loss=zero, val_mse=zero, prior=prior)
 
 
 def scaling(moments: Moments, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -76,9 +79,12 @@ def scaling(moments: Moments, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def forward(model: Model, obs: jax.Array, action: jax.Array, *, net: networks.GaussianMLP) -> networks.Prediction:
-    """What the model says of (Δs, r) (equation 20). Shapes: obs [..., O], action [..., A]."""
-    inputs = jnp.concatenate([obs, action], axis=-1)
-    prediction: Any = net.apply(model.params, (inputs - model.input_mean) / model.input_std)
+    """What the model says of (Δs, r) (equations 20 and 34). Shapes: obs [..., O], action [..., A]."""
+    inputs = (jnp.concatenate([obs, action], axis=-1) - model.input_mean) / model.input_std
+    prior: Any = 0.0
+    if model.prior is not None:
+        prior = model.prior.scale * net.apply(model.prior.params, inputs, method=net.outputs)
+    prediction: Any = net.apply(model.params, inputs, prior)
     return prediction
 
 

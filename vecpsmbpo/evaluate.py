@@ -29,12 +29,12 @@ def evaluate(stored: Settings, settings: Settings) -> int:
     driver = trained if settings == stored else make_driver(settings)
     returns = driver.evaluate(saved.state, evaluation_keys(settings, saved.step), settings.eval_episodes)
     table = Table(title=f"{settings.task} ({settings.backend}) at step {saved.step}, policy: {settings.eval_policy}")
-    for column in ("seed", "episodes", "return", "± s.d.", "lowest", "highest", "length"):
+    for column in (*settings.lanes[0], "episodes", "return", "± s.d.", "lowest", "highest", "length"):
         table.add_column(column, justify="right")
-    for index in range(settings.num_seeds):
+    for index, lane in enumerate(settings.lanes):
         values, lengths = returns.episode_return[index], returns.length[index]
         row = (values.mean(), values.std(), values.min(), values.max(), lengths.mean())
-        table.add_row(str(settings.seed + index), str(values.size), *(f"{value:.1f}" for value in row))
+        table.add_row(*map(str, lane.values()), str(values.size), *(f"{value:.1f}" for value in row))
     Console(highlight=False).print(table)
     return 0
 

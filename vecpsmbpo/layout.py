@@ -52,11 +52,11 @@ class Layout:
         """Uses every device of the process that can be given work, or the first `settings.devices` of them."""
         devices = jax.devices()
         count = min(settings.devices or len(devices), len(devices), settings.parallel_parts)
-        over_seeds = math.gcd(settings.num_seeds, count)
+        over_seeds = math.gcd(len(settings.lanes), count)
         grid = np.array(devices[:count]).reshape(over_seeds, count // over_seeds)
         return cls(
             mesh=Mesh(grid, (SEEDS, MEMBERS)),
-            num_seeds=settings.num_seeds,
+            num_seeds=len(settings.lanes),
             n_models=settings.n_models,
             n_policies=settings.n_policies,
             n_members=settings.n_members,

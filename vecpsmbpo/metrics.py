@@ -6,9 +6,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from tensorboardX import SummaryWriter
 
+from vecpsmbpo import mixture
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
@@ -19,9 +21,11 @@ Line = dict[str, Any]
 class RunLog:
     """The log files of one run directory."""
 
-    def __init__(self, run_dir: Path, env_steps: int):
-        """Lines beyond `env_steps` belong to work that a kill undid and that will be done again: they are dropped."""
-        self._run_dir = run_dir
+    def __init__(self, run_dir: Path, env_steps: int, lane: Iterable[str] = ("seed",)):
+        """`lane`: the names by whose values lines of the same step are told apart.
+
+        Lines beyond `env_steps` belong to work that a kill undid and that will be done again: they are dropped."""
+        self._run_dir, self._lane = run_dir, tuple(lane)
         for name in (METRICS_FILE, EPISODES_FILE):
             _rewind(run_dir / name, env_steps)
         self._tensorboard = SummaryWriter(str(run_dir / TENSORBOARD), purge_step=env_steps + 1)
@@ -42,9 +46,10 @@ class RunLog:
         self._tensorboard.flush()
 
     def _scalars(self, line: Line, names: Iterable[str], group: str) -> None:
+        which = "_".join(f"{name}{line[name]}" for name in self._lane)
         for name in names:
-            if line[name] is not None:
-                self._tensorboard.add_scalar(f"{group}/{name}/seed{line['seed']}", line[name], line["env_steps"])
+            if isinstance(line[name], int | float):
+                self._tensorboard.add_scalar(f"{group}/{name}/{which}", line[name], line["env_steps"])
 
     def close(self) -> None:
         self._tensorboard.close()
@@ -90,11 +95,11 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
         terminated = bool(news.terminated[step, seed])
         lines.append(
             {
-                "seed": settings.seed + int(seed),
+                **settings.lanes[seed],
                 "episode": int(index),
                 "env_steps": env_steps + int(step) + 1,
-                "model": int(member) // settings.n_policies,
-                "policy": int(member) % settings.n_policies,
+                "model": None if member < 0 else int(member) // settings.n_policies,
+                "policy": None if member < 0 else int(member) % settings.n_policies,
                 "return": float(episode_return),
                 "length": int(length),
                 "terminated": terminated,
@@ -107,14 +112,20 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
 
 
 def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
-    """What the train state says of the epoch that has just ended, one line per seed. Null: there was nothing yet."""
+    """What the train state says of the epoch that has just ended, one line per seed (and swept value).
+
+    Null: there was nothing yet.
+    """
     seeds = state.seeds
     stats = {name: np.asarray(value)[:, : settings.n_members] for name, value in vars(seeds.agents.stats).items()}
     updates = stats.pop("updates")
     env_steps = int(state.counters.env_steps)
     learned = updates[:, 0] > 0
+    ratios = jax.vmap(lambda hyper, bandit: mixture.real_ratio(settings, hyper, bandit, state.counters.env_steps))(
+        seeds.hyper, seeds.bandit
+    )
     lines = []
-    for seed in range(settings.num_seeds):
+    for seed, lane in enumerate(settings.lanes):
         episodes = float(seeds.epoch_episodes[seed])
         models = {
             "model_loss": seeds.models.loss[seed, : settings.n_models],
@@ -124,17 +135,20 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
         lines.append(
             {
                 "env_steps": env_steps,
-                "seed": settings.seed + seed,
+                **lane,
                 "train_return": float(seeds.epoch_return[seed]) / episodes if episodes else None,
                 "train_episodes": int(episodes),
                 **{
                     name: float(np.mean(value)) if learned[seed] else None
                     for name, value in {**models, **agents}.items()
                 },
-                "real_ratio": float(seeds.hyper.real_ratio[seed]),
+                "real_ratio": float(ratios[seed]),
                 "temperature": _finite(float(seeds.hyper.temperature[seed])),
             }
         )
+        if seeds.bandit is not None:
+            bandit = jax.tree.map(lambda x, seed=seed: x[seed], seeds.bandit)
+            lines[-1]["real_ratio_probs"] = mixture.probabilities(bandit, settings).tolist()
     return lines
 
 

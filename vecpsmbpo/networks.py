@@ -41,12 +41,16 @@ class GaussianMLP(nn.Module):
     predicts_termination: bool = False
 
     @nn.compact
-    def __call__(self, inputs: jax.Array) -> Prediction:
-        """inputs [..., O + A], whitened."""
+    def outputs(self, inputs: jax.Array) -> jax.Array:
+        """f_θ: inputs [..., O + A], whitened, to what the prediction is made of."""
         hidden = inputs
         for _ in range(self.hidden_layers):
             hidden = nn.swish(nn.Dense(self.hidden_size, kernel_init=model_init)(hidden))
-        outputs = nn.Dense(2 * self.output_size + self.predicts_termination, kernel_init=model_init)(hidden)
+        return nn.Dense(2 * self.output_size + self.predicts_termination, kernel_init=model_init)(hidden)
+
+    def __call__(self, inputs: jax.Array, prior: Any = 0.0) -> Prediction:
+        """The prediction of f_θ + prior. inputs [..., O + A], whitened."""
+        outputs = self.outputs(inputs) + prior
         mean, log_variance, rest = jnp.split(outputs, [self.output_size, 2 * self.output_size], axis=-1)
         log_variance = MAX_LOG_VARIANCE - nn.softplus(MAX_LOG_VARIANCE - log_variance)
         log_variance = MIN_LOG_VARIANCE + nn.softplus(log_variance - MIN_LOG_VARIANCE)

@@ -1,4 +1,4 @@
-"""q(π | D, λ): which member acts (equations 18 and 19)."""
+"""q(π | D, λ): which member acts (equations 18 and 19), and when none of them does (equation 33)."""
 
 import jax
 import jax.numpy as jnp
@@ -32,3 +32,8 @@ def draw(posterior: Posterior, temperature: jax.Array, key: jax.Array) -> tuple[
     """A member, [] int, and the distribution [N·M] that it was drawn from."""
     scores = logits(posterior, temperature)
     return jax.random.categorical(key, scores), jax.nn.softmax(scores)
+
+
+def exploration_probability(forced_exploration: jax.Array, episode: jax.Array) -> jax.Array:
+    """min(1, τ / k): with it episode k, from 1, takes random actions (equation 33)."""
+    return jnp.minimum(1.0, forced_exploration / episode)

@@ -100,7 +100,7 @@ class Rates(NamedTuple):
         if settings.real_ratio < 1:
             refreshes = jnp.asarray(learning[learning % settings.model_update_every == 0])
             imagined = int(np.sum(imagination.rows_per_refresh(settings, refreshes))) * settings.n_members
-        return cls(*(settings.num_seeds * count / seconds for count in (steps, updates, imagined)))
+        return cls(*(len(settings.lanes) * count / seconds for count in (steps, updates, imagined)))
 
 
 class Pace:
@@ -127,7 +127,7 @@ class Pace:
         """Time left; a dash before learning has begun, since warm-up steps say nothing of what follows."""
         if not self._learning:
             return "–"
-        return duration((self._settings.total_steps - env_steps) / self.rates.env_steps * self._settings.num_seeds)
+        return duration((self._settings.total_steps - env_steps) / self.rates.env_steps * len(self._settings.lanes))
 
 
 def duration(seconds: float) -> str:

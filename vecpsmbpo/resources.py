@@ -34,7 +34,7 @@ def working_bytes(settings: Settings, spec: EnvSpec, layout: Layout) -> int:
     """Bytes of the largest temporaries: minibatches of a step, rows in flight of a rollout, on a CPU also the rings
     of one device, which are put together before they are handed to it when a run is resumed."""
     row = 4 * replay.row_size(spec.obs_size, spec.action_size)
-    members = layout.padded_members * settings.num_seeds
+    members = layout.padded_members * layout.num_seeds
     minibatches = 3 * settings.updates_per_step * settings.policy_batch_size * row
     rollout = imagination.chunk_size(settings) * (2 * row + 8 * settings.model_hidden_size)
     working = members * max(minibatches, rollout)

@@ -4,12 +4,15 @@ What each setting does is written beside its value in `configs/`; where a number
 """
 
 import dataclasses
+import functools
+import itertools
 import math
 from collections.abc import Mapping
 from typing import Any
 
 Range = tuple[float | None, float | None]
 Options = tuple[tuple[str, Any], ...]  # name and value of each `env.*` option, in the order of names
+Sweep = tuple[tuple[str, tuple[float, ...]], ...]  # name and values of each `sweep.*`, in the order of names
 
 
 class SettingError(Exception):
@@ -40,6 +43,7 @@ class Settings:
     backend: str = _choice("auto", "mjx", "host")
     seed: int = _whole(0, 2**31 - 1)
     num_seeds: int = _whole(1)
+    sweep: Sweep = ()
     total_steps: int = _whole(1)
     run_dir: str
     # the loop around it
@@ -65,6 +69,7 @@ class Settings:
     model_improvement: float = _real(0, 1)
     model_max_epochs: int = _whole(1)
     validation_ratio: float = _real(0, 0.5, open_low=True)
+    prior_scale: float = _real(0)
     # imagined data
     rollout_starts: int = _whole(1)
     imagined_capacity: int = _whole(1)
@@ -85,7 +90,11 @@ class Settings:
     target_update_rate: float = _real(0, 1, open_low=True)
     # the posterior over policies
     real_ratio: float = _real(0, 1)
+    real_ratio_schedule: str = _choice("constant", "linear", "bandit")
+    real_ratio_arms: tuple[float, ...] = _real(0, 1)
     temperature: float = _real(0, open_low=True)
+    posterior: str = _choice("sample", "average")
+    forced_exploration: float = _real(0)
 
     @property
     def task(self) -> str:
@@ -100,7 +109,25 @@ class Settings:
     @property
     def parallel_parts(self) -> int:
         """How many of the run's parts can be spread over devices: its members or its models, whichever are more."""
-        return self.num_seeds * max(self.n_members, self.n_models)
+        return len(self.lanes) * max(self.n_members, self.n_models)
+
+    @functools.cached_property
+    def lanes(self) -> tuple[dict[str, Any], ...]:
+        """The S learners of the program: every seed with every combination of swept values, as log lines name them."""
+        seeds = [{"seed": self.seed + index} for index in range(self.num_seeds)]
+        names = [name for name, _ in self.sweep]
+        points = itertools.product(*(values for _, values in self.sweep))
+        return tuple({**seed, **dict(zip(names, point, strict=True))} for point in points for seed in seeds)
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether models have a random function prior."""
+        return self.prior_scale > 0 or "prior_scale" in dict(self.sweep)
+
+    @property
+    def adapts_real_ratio(self) -> bool:
+        """Whether λ is chosen online."""
+        return self.real_ratio_schedule == "bandit"
 
     @property
     def refreshes_per_epoch(self) -> int:
@@ -122,8 +149,22 @@ class Settings:
         return round(1 / self.validation_ratio)
 
 
-# The settings that a command line names; the options of a task are `env.*` there.
-FIELDS = {field.name: field for field in dataclasses.fields(Settings) if field.name != "env_options"}
+# The settings that a command line names; the options of a task are `env.*` there, and what is swept is `sweep.*`.
+FIELDS = {field.name: field for field in dataclasses.fields(Settings) if field.name not in ("env_options", "sweep")}
+
+# Settings that are numbers inside the compiled program (`types.Hyper`): several values fit into one program.
+TRACED = (
+    "model_learning_rate",
+    "model_weight_decay",
+    "policy_learning_rate",
+    "discount",
+    "target_entropy",
+    "target_update_rate",
+    "real_ratio",
+    "temperature",
+    "forced_exploration",
+    "prior_scale",
+)
 
 # Settings that a resumed run may change: they steer the loop around the run, not what it computes.
 CHANGEABLE = frozenset({"total_steps", "eval_episodes", "eval_policy", "checkpoint_every", "devices", "compile_cache"})
@@ -135,6 +176,7 @@ def allowed(name: str) -> str:
     if choices := field.metadata.get("choices"):
         return "one of " + ", ".join(choices)
     kinds: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a name"}
+    kinds[tuple[float, ...]] = "a list of numbers, each"
     kind = kinds[field.type]
     low, high = field.metadata.get("range", (None, None))
     above = "above" if field.metadata.get("open_low") else "at least"
@@ -159,6 +201,15 @@ def check(name: str, value: Any) -> Any:
         if not isinstance(value, str) or value not in field.metadata.get("choices", (value,)):
             raise complaint
         return value
+    if field.type == tuple[float, ...]:
+        if not isinstance(value, list | tuple) or not value:
+            raise complaint
+        return tuple(_number(field, item, complaint) for item in value)
+    return _number(field, value, complaint)
+
+
+def _number(field: Any, value: Any, complaint: SettingError) -> Any:
+    """`value`, or the item of a list, as a number in the field's range."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -169,13 +220,26 @@ def check(name: str, value: Any) -> Any:
         if not math.isfinite(number) or number != int(number):
             raise complaint
         number = int(number)
-    elif math.isinf(number) and name != "temperature":  # τ = ∞ is uniform sampling, equation 18
+    elif math.isinf(number) and field.name != "temperature":  # τ = ∞ is uniform sampling, equation 18
         raise complaint
     low, high = field.metadata.get("range", (None, None))
     too_low = low is not None and (number < low or (number == low and field.metadata.get("open_low", False)))
     if too_low or (high is not None and number > high):
         raise complaint
     return number
+
+
+def check_sweep(name: str, values: Any) -> tuple[float, ...]:
+    """The values of `sweep.<name>=[...]`.
+
+    Raises:
+        SettingError: the setting cannot be swept inside one program, or a value is wrong.
+    """
+    if name not in TRACED:
+        raise SettingError(f"sweep.{name}: cannot be swept in one program (-m can); one of {', '.join(TRACED)}")
+    if not isinstance(values, list | tuple) or not values:
+        raise SettingError(f"sweep.{name}={values}: must be a list of values, each {allowed(name)}")
+    return tuple(check(name, value) for value in values)
 
 
 def build(values: Mapping[str, Any]) -> Settings:
@@ -185,7 +249,9 @@ def build(values: Mapping[str, Any]) -> Settings:
         SettingError: a value is wrong, or two contradict.
     """
     options = tuple(sorted(dict(values.get("env_options", ())).items()))
-    settings = Settings(env_options=options, **{name: check(name, values[name]) for name in FIELDS})
+    sweep = tuple((name, check_sweep(name, swept)) for name, swept in sorted(dict(values.get("sweep", ())).items()))
+    checked = {name: check(name, values[name]) for name in FIELDS}
+    settings = Settings(env_options=options, sweep=sweep, **checked)
     if settings.epoch_steps % settings.model_update_every:
         raise SettingError(
             f"model_update_every={settings.model_update_every}: must divide epoch_steps={settings.epoch_steps}"

@@ -52,8 +52,11 @@ def make_driver(settings: Settings) -> Driver:
 
 def initial_inputs(settings: Settings) -> tuple[jax.Array, Hyper]:
     """A key [S] per seed, the same as if that seed ran alone; hyperparameters with leaves [S]."""
-    keys = jax.vmap(jax.random.key)(settings.seed + jnp.arange(settings.num_seeds))
-    return keys, jax.tree.map(lambda x: jnp.full(settings.num_seeds, x), Hyper.of(settings))
+    lanes = settings.lanes
+    keys = jax.vmap(jax.random.key)(jnp.array([lane["seed"] for lane in lanes]))
+    hyper = jax.tree.map(lambda x: jnp.full(len(lanes), x), Hyper.of(settings))
+    swept = {name: jnp.array([lane[name] for lane in lanes], jnp.float32) for name, _ in settings.sweep}
+    return keys, hyper.replace(**swept)
 
 
 def evaluation_keys(settings: Settings, env_steps: int) -> jax.Array:
@@ -99,7 +102,7 @@ class _Run:
         if saved:
             driver.load_env(saved.host["env"])
         self.env_steps = saved.step if saved else 0
-        self.log = metrics.RunLog(self.run_dir, self.env_steps)
+        self.log = metrics.RunLog(self.run_dir, self.env_steps, settings.lanes[0])
         self.display = Display(settings, self.env_steps)
         self.memory = memory
         self.epoch_began = time.perf_counter()
@@ -127,8 +130,9 @@ class _Run:
 
     def _introduce(self) -> None:
         settings, layout = self.settings, self.driver.layout
+        swept = "".join(f"{len(values)} values of {name} × " for name, values in settings.sweep)
         self.display.say(
-            f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × "
+            f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × {swept}"
             f"N = {settings.n_models} models × M = {settings.n_policies} policies"
             f"{' in all of them' if settings.rollout_models == 'any' else ''}, "
             f"{settings.updates_per_step} updates per step, on {layout.mesh.size} {jax.default_backend()} device(s)"
@@ -228,9 +232,10 @@ class _Run:
                 if kind == "models"
                 else f"policy n = {index // self.settings.n_policies}, m = {index % self.settings.n_policies}"
             )
+            lane = ", ".join(f"{name} {value:g}" for name, value in self.settings.lanes[seed].items())
             last = "none" if self.saved_step is None else f"step {self.saved_step}"
             raise Diverged(
-                f"{what} of seed {self.settings.seed + seed}, {member}, stopped being finite between steps {before} "
+                f"{what} of {lane}, {member}, stopped being finite between steps {before} "
                 f"and {self.env_steps}; last good checkpoint: {last} in {self.run_dir}"
             )
 

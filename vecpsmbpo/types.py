@@ -1,7 +1,7 @@
 """The values that pass between the rooms of this program.
 
-Axes, by the same letters everywhere: S seeds, N models, M policies per model, P = N·M members (rounded up to
-the mesh, see `layout`), B batch, T time, O observation, A action, C buffer capacity, F packed row.
+Axes, by the same letters everywhere: S seeds (each with every swept value), N models, M policies per model, P = N·M
+members (rounded up to the mesh, see `layout`), B batch, T time, O observation, A action, C capacity, F packed row.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings import TRACED, Settings
 
 Params = Any  # a pytree of arrays
 TerminationRule = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
@@ -63,10 +63,24 @@ class Hyper(struct.PyTreeNode):
     target_update_rate: jax.Array
     real_ratio: jax.Array
     temperature: jax.Array
+    forced_exploration: jax.Array
+    prior_scale: jax.Array
 
     @classmethod
     def of(cls, settings: Settings) -> "Hyper":
-        return cls(**{name: jnp.float32(getattr(settings, name)) for name in cls.__dataclass_fields__})
+        return cls(**{name: jnp.float32(getattr(settings, name)) for name in TRACED})
+
+
+class Prior(struct.PyTreeNode):
+    """β f_θ0 of equation 34: a function drawn once, which the model's own is added to.
+
+    Attributes:
+        params: θ0, of `networks.GaussianMLP`.
+        scale: [], β.
+    """
+
+    params: Params
+    scale: jax.Array
 
 
 class Model(struct.PyTreeNode):
@@ -78,6 +92,7 @@ class Model(struct.PyTreeNode):
         input_mean, input_std: [O + A], of the data that the model was last fitted on (equation 20).
         loss: [], mean negative log-likelihood (equation 17) over the last epoch of the last fit.
         val_mse: [], validation mean squared error of the parameters kept.
+        prior: or None, where β = 0.
     """
 
     params: Params
@@ -86,6 +101,7 @@ class Model(struct.PyTreeNode):
     input_std: jax.Array
     loss: jax.Array
     val_mse: jax.Array
+    prior: Prior | None
 
 
 class AgentStats(struct.PyTreeNode):
@@ -124,12 +140,30 @@ class Posterior(struct.PyTreeNode):
     compensation: jax.Array
 
 
+class Bandit(struct.PyTreeNode):
+    """What the choice of λ has learned (`mixture`), K arms.
+
+    Attributes:
+        log_weights: [K].
+        arm: [] int, in force.
+        compares: [] bool, whether there was an epoch before.
+        previous, lowest, highest: [], mean returns: of the epoch before, and of all so far.
+    """
+
+    log_weights: jax.Array
+    arm: jax.Array
+    compares: jax.Array
+    previous: jax.Array
+    lowest: jax.Array
+    highest: jax.Array
+
+
 class Episode(struct.PyTreeNode):
     """The real episode that is running.
 
     Attributes:
         index: [] int, k from 1.
-        member: [] int, n·M + m of the acting policy.
+        member: [] int, n·M + m of the acting policy; -1 where all of them act (`posterior=average`).
         random: [] bool, actions are uniform and the return is not credited.
         probs: [N·M], the distribution that `member` was drawn from.
         episode_return, length: [] so far.
@@ -183,6 +217,7 @@ class SeedState(struct.PyTreeNode):
         imagined: [P, C_M, F], D_M^{n,m}: one ring per member.
         moments: of D_E, for whitening.
         posterior, episode: who acts, and how it is going.
+        bandit: which chooses λ; None where nothing is chosen.
         epoch_return, epoch_episodes: [], sum and number of the returns of the episodes that ended this epoch.
     """
 
@@ -195,6 +230,7 @@ class SeedState(struct.PyTreeNode):
     moments: Moments
     posterior: Posterior
     episode: Episode
+    bandit: Bandit | None
     epoch_return: jax.Array
     epoch_episodes: jax.Array
 

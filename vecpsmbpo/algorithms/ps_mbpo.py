@@ -8,11 +8,12 @@ Everything here runs inside `layout.Layout.spread`: models and agents are this d
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 
-from vecpsmbpo import dynamics, imagination, posterior, replay, sac
+from vecpsmbpo import dynamics, imagination, mixture, posterior, replay, sac
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import (
@@ -50,13 +51,16 @@ class PsMbpo:
         return SeedState(
             key=key,
             hyper=hyper,
-            models=jax.vmap(lambda k: dynamics.init(k, settings, spec))(layout.keys(model_key, layout.model_ids())),
+            models=jax.vmap(lambda k: dynamics.init(k, hyper, settings, spec))(
+                layout.keys(model_key, layout.model_ids())
+            ),
             agents=jax.vmap(lambda k: sac.init(k, nets, spec))(layout.keys(agent_key, layout.member_ids())),
             real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
             moments=Moments(mean=jnp.zeros(size), deviation=jnp.zeros(size)),
             posterior=members,
             episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
+            bandit=mixture.init(settings, jax.random.fold_in(draw_key, 2)) if settings.adapts_real_ratio else None,
             epoch_return=jnp.zeros(()),
             epoch_episodes=jnp.zeros(()),
         )
@@ -66,12 +70,19 @@ class PsMbpo:
     def act(self, state: SeedState, obs: jax.Array, key: jax.Array) -> jax.Array:
         """The running episode's action: sampled from its member's policy, or uniform in a random episode.
 
+        With `posterior=average` (figure 6) from the average of all members' action distributions, their mixture with
+        equal weights: a member drawn anew at every step, and its action. (Averaging the actions instead would take one
+        that none of them considers good, wherever they disagree.)
+
         Shapes: obs [O] -> action [A].
         """
         policy_key, uniform_key = jax.random.split(key)
         actor = sac.make_networks(self.settings, self.spec).actor
+        member = state.episode.member
+        if self.settings.posterior == "average":
+            member = jax.random.randint(jax.random.fold_in(key, 1), (), 0, self.settings.n_members)
         action = self.layout.ask(
-            state.episode.member,
+            member,
             state.agents.actor,
             lambda params: actor.law(params, obs).sample(policy_key)[0],
         )
@@ -81,7 +92,7 @@ class PsMbpo:
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> Params:
         """Parameters for `act_greedily`, by `eval_policy`: of the member that the posterior would pick now, of the
         member that has earned the most, or of all members."""
-        if self.settings.eval_policy == "average":
+        if self._evaluates_average:
             return state.agents.actor
         scores = posterior.logits(state.posterior, state.hyper.temperature)
         drawn, _ = posterior.draw(state.posterior, state.hyper.temperature, key)
@@ -91,10 +102,15 @@ class PsMbpo:
     def act_greedily(self, policy: Params, obs: jax.Array) -> jax.Array:
         """Mean action of the evaluation policy; for `average`, averaged over the members. obs [O] -> [A]."""
         actor = sac.make_networks(self.settings, self.spec).actor
-        if self.settings.eval_policy == "average":
+        if self._evaluates_average:
             actions = jax.vmap(lambda params: actor.law(params, obs).mode())(policy)
             return self.layout.mean_over_members(actions)
         return actor.law(policy, obs).mode()
+
+    @property
+    def _evaluates_average(self) -> bool:
+        chosen = self.settings.eval_policy
+        return chosen == "average" or (chosen == "posterior" and self.settings.posterior == "average")
 
     # ── observe ──────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -138,14 +154,28 @@ class PsMbpo:
 
     def _begin_episode(self, members, hyper: Hyper, index, random, key: jax.Array) -> Episode:
         member, probs = posterior.draw(members, hyper.temperature, key)
+        if self.settings.posterior == "average":
+            member = jnp.int32(-1)
+        explores = posterior.exploration_probability(hyper.forced_exploration, index)
+        random |= jax.random.bernoulli(jax.random.fold_in(key, 1), explores)
         zero = jnp.zeros(())
         return Episode(index, member, random, probs, episode_return=zero, length=jnp.int32(0))
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
-    def begin_epoch(self, counters: Counters, state: SeedState) -> SeedState:
-        """Clears the epoch's sums when an epoch begins."""
-        fresh = counters.env_steps % self.settings.epoch_steps == 0
+    def real_ratio(self, counters: Counters, state: SeedState) -> jax.Array:
+        """λ now, []."""
+        return mixture.real_ratio(self.settings, state.hyper, state.bandit, counters.env_steps)
+
+    def begin_epoch(self, counters: Counters, state: SeedState, key: jax.Array) -> SeedState:
+        """Clears the epoch's sums when an epoch begins, and lets the bandit, if there is one, draw λ anew."""
+        settings = self.settings
+        fresh = counters.env_steps % settings.epoch_steps == 0
+        if state.bandit is not None:
+            counts = fresh & (counters.env_steps > settings.first_learning_step) & (state.epoch_episodes > 0)
+            mean_return = state.epoch_return / jnp.maximum(state.epoch_episodes, 1)
+            drawn = mixture.end_round(state.bandit, settings, mean_return, key)
+            state = state.replace(bandit=jax.tree.map(partial(jnp.where, counts), drawn, state.bandit))
 
         def cleared(tree):
             return jax.tree.map(lambda x: jnp.where(fresh, jnp.zeros_like(x), x), tree)
@@ -246,7 +276,7 @@ class PsMbpo:
         imagined_index = replay.sample_newest_indices(
             imagined_key, shape, counters.imagined_rows, imagined.shape[0], newest
         )
-        from_real = jax.random.uniform(source_key, shape) < state.hyper.real_ratio
+        from_real = jax.random.uniform(source_key, shape) < self.real_ratio(counters, state)
         rows = jnp.where(from_real[..., None], state.real[real_index], imagined[imagined_index])
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
 
