@@ -1,9 +1,13 @@
 """The command line: mistakes are one line and exit status 2, create nothing, and never import JAX."""
 
+import dataclasses
+import itertools
 import json
+import math
 import subprocess
 import sys
 
+import hydra
 import pytest
 
 from tests.helpers import command, environment
@@ -31,6 +35,12 @@ MISTAKES = [
     (["train", "n_models=1,2"], "n_models=1,2: several values need -m"),
     (["train", "hopper"], "hopper: must be name=value"),
     (["train", "-m", "n_models=1,0"], "n_models=0: must be a whole number, at least 1"),
+    (["train", "sweep.n_models=[1,2]"], "sweep.n_models: cannot be swept in one program"),
+    (["train", "sweep.real_ratio=0.5"], "sweep.real_ratio=0.5: must be a list of values, each a number from 0 to 1"),
+    (["train", "sweep.real_ratio=[0,2]"], "real_ratio=2: must be a number from 0 to 1"),
+    (["train", "real_ratio_arms=0.5"], "real_ratio_arms=0.5: must be a list of numbers, each from 0 to 1"),
+    (["train", "experiment=fig2"], "experiment=fig2: is a grid of runs and needs -m"),
+    (["train", "-m", "experiment=fig3"], "experiment=fig3: did you mean fig"),
     (["eval"], "run_dir: eval needs run_dir="),
     (["eval", "run_dir=nowhere"], "run_dir=nowhere: holds no config.yaml"),
     (["eval", "run_dir=nowhere", "n_models=2"], "n_models=2: eval takes run_dir="),
@@ -192,3 +202,43 @@ def test_a_damaged_config_is_named(tmp_path):
     (tmp_path / "config.yaml").write_text(json.dumps({"env": "hopper"}))
     with pytest.raises(SettingError, match=r"its config\.yaml cannot be read"):
         config.load(tmp_path)
+
+
+@pytest.mark.parametrize("experiment", config.options("experiment"))
+@pytest.mark.parametrize("size", ["cpu", "paper"])
+def test_every_run_of_every_experiment_composes(experiment, size):
+    with hydra.initialize_config_module("vecpsmbpo.configs", version_base="1.3"):
+        chosen = [f"experiment={experiment}", f"size={size}"]
+        params = hydra.compose("config", chosen, return_hydra_config=True).hydra.sweeper.params
+        names, values = list(params), [str(value).split(",") for value in params.values()]
+        runs = []
+        for point in itertools.product(*values):
+            overrides = [*chosen, *(f"{name}={value}" for name, value in zip(names, point, strict=True))]
+            settings = config.from_tree(hydra.compose("config", overrides), overrides)
+            assert settings.size == size
+            for name, value in zip(names, point, strict=True):
+                assert str(getattr(settings, name)) == value
+            runs.append(settings.run_dir)
+    assert len(set(runs)) == len(runs)
+    assert all(run.startswith(f"runs/{experiment}/") for run in runs)
+
+
+def test_an_experiment_runs_from_the_command_line(tmp_path):
+    """Two runs of figure 6, made cheap: one samples policies and one averages them."""
+    small = ["size=tiny", "env=ball_in_cup", "backend=host", "n_policies=1", "num_seeds=1", "total_steps=40"]
+    result = command("train", "-m", "experiment=fig6", *small, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    runs = sorted((tmp_path / "runs" / "fig6").iterdir())
+    assert ["average" in run.name for run in runs] == [True, False]
+    for run in runs:
+        assert config.load(run).posterior == ("average" if "average" in run.name else "sample")
+        assert (run / "metrics.jsonl").read_text().count("\n") == 1
+
+
+def test_swept_values_are_kept_with_the_run(tmp_path):
+    settings = config.compose(["size=tiny", "num_seeds=2", "seed=5", "sweep.temperature=[1,.inf]"])
+    assert [tuple(lane.values()) for lane in settings.lanes] == [(5, 1.0), (6, 1.0), (5, math.inf), (6, math.inf)]
+    config.save(settings, tmp_path)
+    assert dataclasses.replace(config.load(tmp_path), run_dir=settings.run_dir) == settings
+    with pytest.raises(SettingError, match="contradicts the run"):
+        config.resolve([f"run_dir={tmp_path}", "sweep.temperature=[1,2]"])

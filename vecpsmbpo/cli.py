@@ -12,6 +12,8 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo train env=cartpole_swingup size=cpu     train; name=value as many as wanted
   vecpsmbpo train run_dir=runs/x                    go on with the run in runs/x
   vecpsmbpo train -m env=hopper real_ratio=0,0.05   one run after the other, for every value (Hydra multirun)
+  vecpsmbpo train env=hopper sweep.real_ratio=[0,0.05]      every value at once, in one program
+  vecpsmbpo train -m experiment=fig2 size=cpu       the runs behind a figure of the paper
   vecpsmbpo eval run_dir=runs/x episodes=10         evaluate it
   vecpsmbpo envs                                    tasks, backends, sizes
   vecpsmbpo theory                                  the paper's theory in numbers, in seconds
@@ -134,7 +136,9 @@ def _help() -> str:
 
     plain = [name for name in FIELDS if name not in config.GROUPS]
     return HELP.format(
-        groups="\n".join(f"{group + '=':10}{', '.join(config.options(group))}" for group in config.GROUPS),
+        groups="\n".join(
+            f"{group + '=':12}{', '.join(config.options(group))}" for group in (*config.GROUPS, "experiment")
+        ),
         settings=textwrap.fill(", ".join(plain), 110, subsequent_indent="          "),
         config=resources.files("vecpsmbpo.configs") / "config.yaml",
     )

@@ -74,6 +74,8 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
         values = _sweep_values(override) if override.is_sweep_override() else [override.value()]
         for value in values:
             found[name] = _check_override(name, value)
+    if "experiment" in found and not sweep:
+        raise SettingError(f"experiment={found['experiment']}: is a grid of runs and needs -m")
     _check_env_options(found)
     return found
 
@@ -104,6 +106,10 @@ def _check_override(name: str, value: Any) -> Any:
     if name in GROUPS:
         if value not in options(name):
             raise SettingError(f"{name}={value}: {closest(str(value), options(name))}")
+        return value
+    if name == "experiment":
+        if value not in options(name):
+            raise SettingError(f"experiment={value}: {closest(str(value), options(name))}")
         return value
     if name.startswith("env."):
         return value
@@ -159,11 +165,12 @@ def _default_run_dir(settings, overrides: Sequence[str]) -> str:
     """The same command gives the same directory, so that running it again goes on with the run."""
     extra = sorted(text for text in overrides if text.split("=")[0].lstrip("+") not in _UNNAMED)
     task = [str(value) for _, value in settings.env_options if any(text.startswith("env.") for text in extra)]
-    others = [text for text in extra if not text.startswith(("hydra", "env."))]
+    others = [text for text in extra if not text.startswith(("hydra", "env.", "experiment="))]
+    experiment = [text.removeprefix("experiment=") for text in extra if text.startswith("experiment=")]
     parts = [settings.env, *task, settings.algo, settings.size, f"seed{settings.seed}", *others]
     # Only what the command line reads back without quotes.
     parts = [re.sub(r"[^\w.+-]", "_", part.replace("=", "")) for part in parts]
-    return str(Path("runs") / "-".join(parts))
+    return str(Path("runs", *experiment) / "-".join(parts))
 
 
 def save(settings, run_dir: Path) -> None:
@@ -202,7 +209,7 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None):
     Raises:
         SettingError: a mistake in `overrides`, or one contradicts the stored run.
     """
-    given = parse(overrides)
+    given = parse(overrides, sweep=tree is not None)
 
     def new():
         return compose(overrides) if tree is None else from_tree(tree, overrides)

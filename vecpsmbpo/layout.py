@@ -201,7 +201,8 @@ class Layout:
         by_place: dict[tuple[int, ...], np.ndarray] = {}
         for shard in rings.addressable_shards:
             part = _view(shard.data)
-            for inside, place in zip(np.ndindex(part.shape[:-2]), _places(shard.index[:-2], rings.shape), strict=True):
+            where: Any = shard.index
+            for inside, place in zip(np.ndindex(part.shape[:-2]), _places(where[:-2], rings.shape), strict=True):
                 by_place[place] = part[inside]
         return [by_place[place] for place in np.ndindex(self.num_seeds, *([members] if members else []))]
 
@@ -218,7 +219,8 @@ class Layout:
         number = {place: i for i, place in enumerate(np.ndindex(*count))}
         sharding = NamedSharding(self.mesh, spec)
         replicas: dict[tuple[tuple[int, ...], ...], list[Any]] = {}
-        for device, where in sharding.addressable_devices_indices_map(like.shape).items():
+        whole: Any = sharding.addressable_devices_indices_map(like.shape)
+        for device, where in whole.items():
             replicas.setdefault(tuple(_places(where[:-2], like.shape)), []).append(device)
         parts = []
         for places, devices in replicas.items():
@@ -231,7 +233,7 @@ class Layout:
         return jax.make_array_from_single_device_arrays(like.shape, sharding, parts)
 
 
-def _view(x: jax.Array) -> np.ndarray:
+def _view(x: Any) -> np.ndarray:
     """`x` on the host, and not copied if it is there already.
 
     `np.asarray` would not copy either, but jax keeps its view as long as `x` lives: a program that is then given `x`

@@ -211,7 +211,7 @@ def check(name: str, value: Any) -> Any:
 def _number(field: Any, value: Any, complaint: SettingError) -> Any:
     """`value`, or the item of a list, as a number in the field's range."""
     try:
-        number = float(value)
+        number = math.inf if value == ".inf" else float(value)  # as YAML spells it
     except (TypeError, ValueError):
         raise complaint from None
     if isinstance(value, bool) or math.isnan(number):
