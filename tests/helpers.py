@@ -10,10 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from vecpsmbpo import config, metrics
-from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
+from vecpsmbpo import algorithms, config, metrics
 from vecpsmbpo.envs.host.batched import HostEnv
-from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.train import initial_inputs
 from vecpsmbpo.types import EnvSpec, SeedState
@@ -33,11 +31,11 @@ def tiny(**changes: Any) -> Settings:
     return config.compose(["size=tiny", *(f"{name}={value}" for name, value in changes.items())])
 
 
-def algorithm(settings: Settings, spec: EnvSpec) -> PsMbpo:
-    return PsMbpo(settings, spec, Layout.of(settings))
+def algorithm(settings: Settings, spec: EnvSpec) -> Any:
+    return algorithms.make(settings, spec)
 
 
-def initial(algorithm: PsMbpo) -> SeedState:
+def initial(algorithm: algorithms.Algorithm) -> SeedState:
     """The state of all seeds before the first step."""
     specs = algorithm.layout.specs().seeds
     init = algorithm.layout.spread(jax.vmap(algorithm.init), (specs.key, specs.key), specs)

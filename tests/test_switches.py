@@ -200,7 +200,8 @@ def test_the_average_s_actions_come_from_all_members(key):
         state = state.replace(
             agents=state.agents.replace(actor=actors), episode=state.episode.replace(random=jnp.bool_(False))
         )
-        return jax.vmap(lambda key: learner.act(state, jnp.zeros(1), key))(jax.random.split(key, 4000))
+        keys = jax.random.split(key, 4000)
+        return jax.vmap(lambda key: learner.act(counters, state, jnp.zeros(1), key)[0])(keys)
 
     shared = learner.layout.specs().counters
     actions = learner.layout.spread(act, (shared, shared), shared)(Counters(jnp.int32(0), jnp.int32(0)), key)

@@ -6,10 +6,12 @@ number of strides, a few steps each, decided when the program is called: one com
 length, and how a run is cut into chunks does not change it.
 """
 
+import itertools
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -17,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
+from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.layout import SEEDS, Layout
 from vecpsmbpo.settings import Settings
@@ -39,7 +41,7 @@ class Returns(NamedTuple):
 class Driver(Protocol):
     """What `train` and `evaluate` need of a driver."""
 
-    algorithm: PsMbpo
+    algorithm: Algorithm
     layout: Layout
     compile_seconds: float
 
@@ -74,7 +76,7 @@ def over_seeds(function: Callable) -> Callable:
     return batched
 
 
-def begin_stride(algorithm: PsMbpo, state: TrainState) -> tuple[TrainState, jax.Array]:
+def begin_stride(algorithm: Algorithm, state: TrainState) -> tuple[TrainState, jax.Array]:
     """Refreshes models and imagined data where a period begins, and says whether this period learns: not before the
     warm-up is over.
 
@@ -84,13 +86,12 @@ def begin_stride(algorithm: PsMbpo, state: TrainState) -> tuple[TrainState, jax.
     counters, seeds = state.counters, state.seeds
     into_period = counters.env_steps % algorithm.settings.model_update_every
     learning = counters.env_steps - into_period >= algorithm.settings.warmup_steps
-    advanced, keys = split_keys(seeds, 3)
+    advanced, keys = split_keys(seeds, 2)
     seeds = seeds.replace(key=jnp.where(into_period == 0, advanced.key, seeds.key))
-    seeds = over_seeds(algorithm.begin_epoch)(counters, seeds, keys[:, 2])
+    seeds = over_seeds(algorithm.begin_epoch)(counters, seeds, keys[:, 0])
     only_real = over_seeds(algorithm.real_ratio)(counters, seeds) >= 1
     imagining = (into_period == 0) & learning & algorithm.layout.any_seed(~only_real)
-    seeds = over_seeds(lambda c, s, k: algorithm.fit_models(c, s, imagining, k))(counters, seeds, keys[:, 0])
-    seeds = over_seeds(lambda c, s, k: algorithm.imagine(c, s, imagining, k))(counters, seeds, keys[:, 1])
+    seeds = over_seeds(lambda c, s, k: algorithm.refresh(c, s, imagining, k))(counters, seeds, keys[:, 1])
     counters = counters._replace(imagined_rows=algorithm.imagined_rows(counters, imagining))
     return state.replace(counters=counters, seeds=seeds), learning
 
@@ -102,7 +103,7 @@ def split_keys(seeds: SeedState, count: int) -> tuple[SeedState, jax.Array]:
 
 
 def observe_and_learn(
-    algorithm: PsMbpo,
+    algorithm: Algorithm,
     counters: Counters,
     seeds: SeedState,
     transition: Transition,
@@ -123,13 +124,25 @@ def observe_and_learn(
     return counters, seeds.replace(agents=agents), end
 
 
+def greedily(
+    algorithm: Algorithm, policy: Any, step: jax.Array, memory: Any, obs: jax.Array, keys: jax.Array
+) -> tuple[jax.Array, Any]:
+    """Actions [E, A] of the evaluation policy of one seed in E episodes, at the same step of each, and their memory.
+
+    Args:
+        memory, obs, keys: leaves [E, ...]; an episode's key serves all its steps.
+    """
+    keys = jax.vmap(lambda key: jax.random.fold_in(key, step))(keys)
+    return jax.vmap(partial(algorithm.act_greedily, policy, step))(memory, obs, keys)
+
+
 # ── MJX: everything in one program ───────────────────────────────────────────────────────────────────────────────
 
 
 class ScanDriver:
     """Real steps, refits, rollouts and updates as one compiled program over the mesh."""
 
-    def __init__(self, algorithm: PsMbpo, env: Any):
+    def __init__(self, algorithm: Algorithm, env: Any):
         self.algorithm, self.env = algorithm, env
         self.settings: Settings = algorithm.settings
         self.layout = algorithm.layout
@@ -198,7 +211,8 @@ class ScanDriver:
         """One real step of every seed's environment, and what follows it."""
         seeds, keys = split_keys(state.seeds, 4)
         obs = state.env.obs
-        action = jax.vmap(self.algorithm.act)(seeds, obs, keys[:, 0])
+        action, memory = over_seeds(self.algorithm.act)(state.counters, seeds, obs, keys[:, 0])
+        seeds = seeds.replace(memory=memory)
         env = jax.vmap(self.env.step)(state.env, action)
         transition = Transition(obs, action, env.reward, env.obs, env.done)
         truncated = (seeds.episode.length + 1 >= self.settings.episode_length) & (env.done == 0)
@@ -219,11 +233,11 @@ class ScanDriver:
             policy = self.algorithm.evaluation_policy(seed, keys[0])
 
             def step(carry):
-                t, env, total, length, alive = carry
-                action = jax.vmap(lambda obs: self.algorithm.act_greedily(policy, obs))(env.obs)
+                t, memory, env, total, length, alive = carry
+                action, memory = greedily(self.algorithm, policy, t, memory, env.obs, keys[1:])
                 env = jax.vmap(self.env.step)(env, action)
                 total = total + jnp.where(alive, env.reward, 0.0)
-                return t + 1, env, total, length + alive, alive & (env.done == 0)
+                return t + 1, memory, env, total, length + alive, alive & (env.done == 0)
 
             def running(carry):
                 t, *_, alive = carry
@@ -231,11 +245,17 @@ class ScanDriver:
 
             count = keys.shape[0] - 1
             start = jax.vmap(self.env.reset)(keys[1:])
-            carry = (0, start, jnp.zeros(count), jnp.zeros(count, jnp.int32), jnp.ones(count, bool))
-            _, _, total, length, _ = jax.lax.while_loop(running, step, carry)
+            memory = many(self.algorithm.memory(), count)
+            carry = (0, memory, start, jnp.zeros(count), jnp.zeros(count, jnp.int32), jnp.ones(count, bool))
+            *_, total, length, _ = jax.lax.while_loop(running, step, carry)
             return total, length
 
         return jax.vmap(one_seed)(seeds, keys)
+
+
+def many(tree: Any, *counts: int) -> Any:
+    """Copies: leaves [...] -> [*counts, ...]."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (*counts, *x.shape)), tree)
 
 
 def _split(keys: jax.Array, episodes: int) -> jax.Array:
@@ -249,7 +269,7 @@ def _split(keys: jax.Array, episodes: int) -> jax.Array:
 class HostDriver:
     """The same functions, jitted one by one, with a simulator stepped between them."""
 
-    def __init__(self, algorithm: PsMbpo, make_env: Callable[..., HostEnv]):
+    def __init__(self, algorithm: Algorithm, make_env: Callable[..., HostEnv]):
         """
         Args:
             make_env: (num_envs, seed) -> the batched environment.
@@ -265,16 +285,18 @@ class HostDriver:
         spread = self.layout.spread
         self._init = spread(self._init_local, (_BY_SEED, _BY_SEED, _BY_SEED), specs)
         self._begin = spread(lambda state: begin_stride(algorithm, state), (specs,), (specs, _SHARED), donate_argnums=0)
-        self._act = spread(self._act_local, (seeds, _BY_SEED), (_BY_SEED, _BY_SEED))
+        self._act = spread(self._act_local, (specs.counters, seeds, _BY_SEED), (_BY_SEED, _BY_SEED, _BY_SEED))
         self._observe = spread(
             self._observe_local,
-            (specs, _BY_SEED, _BY_SEED, _BY_SEED, _BY_SEED, _SHARED),
+            (specs, _BY_SEED, _BY_SEED, _BY_SEED, _BY_SEED, _BY_SEED, _SHARED),
             (specs, _BY_SEED),
             donate_argnums=0,
         )
         self._policy = spread(jax.vmap(algorithm.evaluation_policy), (seeds, _BY_SEED), _BY_SEED)
         self._act_greedily = spread(
-            jax.vmap(jax.vmap(algorithm.act_greedily, in_axes=(None, 0))), (_BY_SEED, _BY_SEED), _BY_SEED
+            jax.vmap(partial(greedily, algorithm), in_axes=(0, None, 0, 0, 0)),
+            (_BY_SEED, _SHARED, _BY_SEED, _BY_SEED, _BY_SEED),
+            (_BY_SEED, _BY_SEED),
         )
 
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
@@ -294,11 +316,11 @@ class HostDriver:
 
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
         obs = state.env
-        action, keys = self._act(state.seeds, obs)
+        action, memory, keys = self._act(state.counters, state.seeds, obs)
         step = self._env.step(np.asarray(action))
         terminated = step.terminated.astype(np.float32)
         transition = Transition(*map(jnp.asarray, (obs, action, step.reward, step.next_obs, terminated)))
-        state, end = self._observe(state, transition, step.truncated, keys, step.obs, learning)
+        state, end = self._observe(state, memory, transition, step.truncated, keys, step.obs, learning)
         return state, jax.tree.map(np.asarray, end)
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
@@ -310,9 +332,13 @@ class HostDriver:
         env.episode_length = self.settings.episode_length
         obs = env.reset()
         count = seeds * episodes
+        memory = many(self.algorithm.memory(), seeds, episodes)
         total, length, alive = np.zeros(count), np.zeros(count, int), np.ones(count, bool)
-        while alive.any():
-            action = self._act_greedily(policy, obs.reshape(seeds, episodes, obs_size))
+        for t in itertools.count():
+            if not alive.any():
+                break
+            states = obs.reshape(seeds, episodes, obs_size)
+            action, memory = self._act_greedily(policy, jnp.int32(t), memory, states, split[:, 1:])
             step = env.step(np.asarray(action).reshape(count, -1))
             obs = step.obs
             total += np.where(alive, step.reward, 0.0)
@@ -330,22 +356,23 @@ class HostDriver:
         counters = Counters(env_steps=jnp.int32(0), imagined_rows=jnp.int32(0))
         return TrainState(counters, jax.vmap(self.algorithm.init)(keys, hyper), obs)
 
-    def _act_local(self, seeds: SeedState, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _act_local(self, counters: Counters, seeds: SeedState, obs: jax.Array) -> tuple[jax.Array, Any, jax.Array]:
         # The key is not advanced here but in `_observe_local`, which splits the same one: acting needs no copy of
         # the state, and changes nothing.
         _, keys = split_keys(seeds, 3)
-        return jax.vmap(self.algorithm.act)(seeds, obs, keys[:, 0]), keys[:, 1:]
+        return *over_seeds(self.algorithm.act)(counters, seeds, obs, keys[:, 0]), keys[:, 1:]
 
     def _observe_local(
         self,
         state: TrainState,
+        memory: Any,
         transition: Transition,
         truncated: jax.Array,
         keys: jax.Array,
         obs: jax.Array,
         learning: jax.Array,
     ) -> tuple[TrainState, EpisodeEnd]:
-        seeds, _ = split_keys(state.seeds, 3)
+        seeds, _ = split_keys(state.seeds.replace(memory=memory), 3)
         counters, seeds, end = observe_and_learn(
             self.algorithm, state.counters, seeds, transition, truncated, keys, learning
         )

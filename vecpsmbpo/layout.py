@@ -110,11 +110,24 @@ class Layout:
         chosen = self.model_of(self.member_ids())
         return jax.tree.map(lambda x: _everywhere(x)[chosen], models)
 
+    def all_models(self, models: Any) -> Any:
+        """This device's models [N_local, ...] -> all of them, [N, ...]."""
+        return jax.tree.map(lambda x: _everywhere(x)[: self.n_models], models)
+
     def all_models_for_members(self, models: Any) -> Any:
         """This device's models [N_local, ...] -> all N of them for each of its members, [P_local, N, ...]."""
         members = self.member_ids().shape[0]
-        real = jax.tree.map(lambda x: _everywhere(x)[: self.n_models], models)
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), real)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), self.all_models(models))
+
+    def share(self, function: Callable[[jax.Array, jax.Array], jax.Array], items: jax.Array) -> jax.Array:
+        """`function` of (items [K', ...], their indices [K']) -> [K'], each device doing its part of the K: [K].
+
+        The same `items` are on every device, and so is the answer.
+        """
+        count = items.shape[0]
+        local = -(-count // self.shards)
+        ids = jnp.minimum(jax.lax.axis_index(MEMBERS) * local + jnp.arange(local), count - 1)
+        return _everywhere(function(items[ids], ids))[:count]
 
     def ask(self, member: jax.Array, tree: Any, function: Callable = lambda params: params) -> Any:
         """`function` of the leaves [...] that `member` has in `tree` [P_local, ...]: computed by every device for one
@@ -175,7 +188,7 @@ class Layout:
 
     def _resize(self, state: TrainState, models: int, members: int) -> TrainState:
         seeds = state.seeds
-        if seeds.agents.log_alpha.shape[1] == members and seeds.models.loss.shape[1] == models:
+        if seeds.agents.stats.updates.shape[1] == members and seeds.models.loss.shape[1] == models:
             return state
 
         def resize(tree, count):

@@ -120,7 +120,7 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     stats = {name: np.asarray(value)[:, : settings.n_members] for name, value in vars(seeds.agents.stats).items()}
     updates = stats.pop("updates")
     env_steps = int(state.counters.env_steps)
-    learned = updates[:, 0] > 0
+    fitted = np.asarray(seeds.models.optimizer.count)[:, 0] > 0
     ratios = jax.vmap(lambda hyper, bandit: mixture.real_ratio(settings, hyper, bandit, state.counters.env_steps))(
         seeds.hyper, seeds.bandit
     )
@@ -132,16 +132,15 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
             "model_val_mse": seeds.models.val_mse[seed, : settings.n_models],
         }
         agents = {name: value[seed] / np.maximum(updates[seed], 1) for name, value in stats.items()}
+        learned = updates[seed, 0] > 0
         lines.append(
             {
                 "env_steps": env_steps,
                 **lane,
                 "train_return": float(seeds.epoch_return[seed]) / episodes if episodes else None,
                 "train_episodes": int(episodes),
-                **{
-                    name: float(np.mean(value)) if learned[seed] else None
-                    for name, value in {**models, **agents}.items()
-                },
+                **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
+                **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
                 "real_ratio": float(ratios[seed]),
                 "temperature": _finite(float(seeds.hyper.temperature[seed])),
             }

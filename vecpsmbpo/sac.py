@@ -37,12 +37,8 @@ def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> Agent:
         actor_optimizer=optim.init(actor),
         critic_optimizer=optim.init(critic),
         alpha_optimizer=optim.init(log_alpha),
-        stats=no_stats(),
+        stats=AgentStats.zero(),
     )
-
-
-def no_stats() -> AgentStats:
-    return AgentStats(*jnp.zeros(6))
 
 
 def target_value(

@@ -88,6 +88,13 @@ class Settings:
     discount: float = _real(0, 1)
     target_entropy: float = _real()
     target_update_rate: float = _real(0, 1, open_low=True)
+    # plans (PETS)
+    plan_horizon: int = _whole(1)
+    plan_hold: int = _whole(1)
+    plan_population: int = _whole(2)
+    plan_elites: int = _whole(1)
+    plan_iterations: int = _whole(1)
+    plan_particles: int = _whole(1)
     # the posterior over policies
     real_ratio: float = _real(0, 1)
     real_ratio_schedule: str = _choice("constant", "linear", "bandit")
@@ -104,7 +111,12 @@ class Settings:
     @property
     def n_members(self) -> int:
         """The policies that the posterior draws from: N·M, or M where none belongs to a model."""
-        return self.n_policies * (self.n_models if self.rollout_models == "own" else 1)
+        return self.n_policies * (self.n_models if self.rollout_models == "own" and not self.plans else 1)
+
+    @property
+    def plans(self) -> bool:
+        """Whether actions are planned in the models, and no policy is learned."""
+        return self.algo == "pets"
 
     @property
     def parallel_parts(self) -> int:
@@ -265,6 +277,12 @@ def build(values: Mapping[str, Any]) -> Settings:
     if settings.warmup_steps < settings.validation_block:
         raise SettingError(
             f"warmup_steps={settings.warmup_steps}: must be at least 1 / validation_ratio = {settings.validation_block}"
+        )
+    if settings.plan_elites > settings.plan_population:
+        raise SettingError(f"plan_elites={settings.plan_elites}: must be at most plan_population")
+    if settings.plans and settings.plan_particles % settings.n_models:
+        raise SettingError(
+            f"plan_particles={settings.plan_particles}: must be a multiple of n_models={settings.n_models}"
         )
     if settings.replay_capacity < settings.warmup_steps:
         raise SettingError(f"replay_capacity={settings.replay_capacity}: must be at least warmup_steps")

@@ -16,10 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import checkpoint, config, envs, metrics, resources, runtime
-from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
+from vecpsmbpo import algorithms, checkpoint, config, envs, metrics, resources, runtime
 from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
-from vecpsmbpo.layout import Layout
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Hyper, TrainState
@@ -46,7 +44,7 @@ def make_driver(settings: Settings) -> Driver:
     env = make_env(seed=settings.seed)
     if not settings.episode_length:
         settings = dataclasses.replace(settings, episode_length=env.spec.episode_length)
-    algorithm = PsMbpo(settings, env.spec, Layout.of(settings))
+    algorithm = algorithms.make(settings, env.spec)
     return ScanDriver(algorithm, env) if settings.backend == "mjx" else HostDriver(algorithm, make_env)
 
 

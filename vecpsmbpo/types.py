@@ -114,6 +114,16 @@ class AgentStats(struct.PyTreeNode):
     q_mean: jax.Array
     entropy: jax.Array
 
+    @classmethod
+    def zero(cls) -> "AgentStats":
+        return cls(*jnp.zeros(len(cls.__dataclass_fields__)))
+
+
+class Planner(struct.PyTreeNode):
+    """A member that plans: it has nothing to learn."""
+
+    stats: AgentStats
+
 
 class Agent(struct.PyTreeNode):
     """One soft actor-critic: networks, target, temperature α, and the state of Adam for each."""
@@ -217,6 +227,7 @@ class SeedState(struct.PyTreeNode):
         imagined: [P, C_M, F], D_M^{n,m}: one ring per member.
         moments: of D_E, for whitening.
         posterior, episode: who acts, and how it is going.
+        memory: what acting remembers within an episode.
         bandit: which chooses λ; None where nothing is chosen.
         epoch_return, epoch_episodes: [], sum and number of the returns of the episodes that ended this epoch.
     """
@@ -230,6 +241,7 @@ class SeedState(struct.PyTreeNode):
     moments: Moments
     posterior: Posterior
     episode: Episode
+    memory: Any
     bandit: Bandit | None
     epoch_return: jax.Array
     epoch_episodes: jax.Array

@@ -1,1 +1,14 @@
-"""One file per algorithm: init, act, observe, refresh and learn, written for one seed."""
+"""One file per algorithm over the functions of `base.Algorithm`."""
+
+from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.algorithms.pets import Pets
+from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
+from vecpsmbpo.layout import Layout
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import EnvSpec
+
+
+def make(settings: Settings, spec: EnvSpec) -> Algorithm:
+    """The algorithm that `algo=` names, on this process's devices."""
+    chosen = Pets if settings.plans else PsMbpo
+    return chosen(settings, spec, Layout.of(settings))

@@ -2,92 +2,40 @@
 
 MBPO and SAC are settings of it: one policy that learns in all models (`rollout_models=any`), and one that learns from
 real data alone (λ = 1, equation 15). They share every line, so that comparisons differ in the posterior only.
-
-Everything here runs inside `layout.Layout.spread`: models and agents are this device's share, [N_local, ...] and
-[P_local, ...]. `counters` are shared by all seeds.
 """
 
-from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from vecpsmbpo import dynamics, imagination, mixture, posterior, replay, sac
-from vecpsmbpo.layout import Layout
-from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import (
-    Agent,
-    Counters,
-    EnvSpec,
-    Episode,
-    EpisodeEnd,
-    Hyper,
-    Moments,
-    Params,
-    SeedState,
-    Transition,
-)
+from vecpsmbpo import imagination, posterior, replay, sac
+from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.types import Agent, Counters, Params, SeedState, Transition
 
 
-@dataclass(frozen=True)
-class PsMbpo:
-    """The algorithm's functions over fixed shapes."""
+class PsMbpo(Algorithm):
+    """Policies that learn by SAC from real and imagined data."""
 
-    settings: Settings
-    spec: EnvSpec
-    layout: Layout
-
-    # ── init ─────────────────────────────────────────────────────────────────────────────────────────────────
-
-    def init(self, key: jax.Array, hyper: Hyper) -> SeedState:
-        """The state before the first step. The first episode is a warm-up episode."""
-        settings, spec, layout = self.settings, self.spec, self.layout
-        nets = sac.make_networks(settings, spec)
-        key, model_key, agent_key, draw_key = jax.random.split(key, 4)
-        members = posterior.init(settings.n_members)
-        size = spec.obs_size + spec.action_size
-        ring = replay.init(imagination.ring_capacity(settings), spec.obs_size, spec.action_size)
-        return SeedState(
-            key=key,
-            hyper=hyper,
-            models=jax.vmap(lambda k: dynamics.init(k, hyper, settings, spec))(
-                layout.keys(model_key, layout.model_ids())
-            ),
-            agents=jax.vmap(lambda k: sac.init(k, nets, spec))(layout.keys(agent_key, layout.member_ids())),
-            real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
-            imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
-            moments=Moments(mean=jnp.zeros(size), deviation=jnp.zeros(size)),
-            posterior=members,
-            episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
-            bandit=mixture.init(settings, jax.random.fold_in(draw_key, 2)) if settings.adapts_real_ratio else None,
-            epoch_return=jnp.zeros(()),
-            epoch_episodes=jnp.zeros(()),
-        )
+    def init_agent(self, key: jax.Array) -> Agent:
+        return sac.init(key, sac.make_networks(self.settings, self.spec), self.spec)
 
     # ── act ──────────────────────────────────────────────────────────────────────────────────────────────────
 
-    def act(self, state: SeedState, obs: jax.Array, key: jax.Array) -> jax.Array:
-        """The running episode's action: sampled from its member's policy, or uniform in a random episode.
+    def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+        """An action sampled from the policy of the episode's member.
 
         With `posterior=average` (figure 6) from the average of all members' action distributions, their mixture with
         equal weights: a member drawn anew at every step, and its action. (Averaging the actions instead would take one
         that none of them considers good, wherever they disagree.)
-
-        Shapes: obs [O] -> action [A].
         """
-        policy_key, uniform_key = jax.random.split(key)
         actor = sac.make_networks(self.settings, self.spec).actor
         member = state.episode.member
         if self.settings.posterior == "average":
-            member = jax.random.randint(jax.random.fold_in(key, 1), (), 0, self.settings.n_members)
-        action = self.layout.ask(
-            member,
-            state.agents.actor,
-            lambda params: actor.law(params, obs).sample(policy_key)[0],
-        )
-        uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0, maxval=1.0)
-        return jnp.where(state.episode.random, uniform, action)
+            key, member_key = jax.random.split(key)
+            member = jax.random.randint(member_key, (), 0, self.settings.n_members)
+        action = self.layout.ask(member, state.agents.actor, lambda params: actor.law(params, obs).sample(key)[0])
+        return action, ()
 
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> Params:
         """Parameters for `act_greedily`, by `eval_policy`: of the member that the posterior would pick now, of the
@@ -99,110 +47,28 @@ class PsMbpo:
         member = jnp.argmax(scores) if self.settings.eval_policy == "best" else drawn
         return self.layout.ask(member, state.agents.actor)
 
-    def act_greedily(self, policy: Params, obs: jax.Array) -> jax.Array:
-        """Mean action of the evaluation policy; for `average`, averaged over the members. obs [O] -> [A]."""
+    def act_greedily(
+        self, policy: Params, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, Any]:
+        """Mean action of the evaluation policy; for `average`, averaged over the members."""
         actor = sac.make_networks(self.settings, self.spec).actor
         if self._evaluates_average:
             actions = jax.vmap(lambda params: actor.law(params, obs).mode())(policy)
-            return self.layout.mean_over_members(actions)
-        return actor.law(policy, obs).mode()
+            return self.layout.mean_over_members(actions), ()
+        return actor.law(policy, obs).mode(), ()
 
     @property
     def _evaluates_average(self) -> bool:
         chosen = self.settings.eval_policy
         return chosen == "average" or (chosen == "posterior" and self.settings.posterior == "average")
 
-    # ── observe ──────────────────────────────────────────────────────────────────────────────────────────────
-
-    def observe(
-        self,
-        counters: Counters,
-        state: SeedState,
-        transition: Transition,
-        truncated: jax.Array,
-        key: jax.Array,
-    ) -> tuple[SeedState, EpisodeEnd]:
-        """Stores a real transition; where it ends the episode, credits the member and draws the next one."""
-        episode = state.episode
-        total = episode.episode_return + transition.reward
-        length = episode.length + 1
-        terminated = transition.terminated > 0
-        done = terminated | truncated
-        end = EpisodeEnd(
-            done=done,
-            index=episode.index,
-            member=episode.member,
-            random=episode.random,
-            terminated=terminated,
-            episode_return=total,
-            length=length,
-            probs=episode.probs,
-        )
-        members = posterior.credit(state.posterior, episode.member, total, done & ~episode.random)
-        random = counters.env_steps + 1 < self.settings.warmup_steps
-        following = self._begin_episode(members, state.hyper, episode.index + 1, random, key)
-        running = episode.replace(episode_return=total, length=length)
-        state = state.replace(
-            real=replay.add(state.real, replay.pack(transition)[None], counters.env_steps),
-            moments=_welford(state.moments, transition, counters.env_steps),
-            posterior=members,
-            episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
-            epoch_return=state.epoch_return + jnp.where(done, total, 0.0),
-            epoch_episodes=state.epoch_episodes + done,
-        )
-        return state, end
-
-    def _begin_episode(self, members, hyper: Hyper, index, random, key: jax.Array) -> Episode:
-        member, probs = posterior.draw(members, hyper.temperature, key)
-        if self.settings.posterior == "average":
-            member = jnp.int32(-1)
-        explores = posterior.exploration_probability(hyper.forced_exploration, index)
-        random |= jax.random.bernoulli(jax.random.fold_in(key, 1), explores)
-        zero = jnp.zeros(())
-        return Episode(index, member, random, probs, episode_return=zero, length=jnp.int32(0))
-
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
-    def real_ratio(self, counters: Counters, state: SeedState) -> jax.Array:
-        """λ now, []."""
-        return mixture.real_ratio(self.settings, state.hyper, state.bandit, counters.env_steps)
-
-    def begin_epoch(self, counters: Counters, state: SeedState, key: jax.Array) -> SeedState:
-        """Clears the epoch's sums when an epoch begins, and lets the bandit, if there is one, draw λ anew."""
-        settings = self.settings
-        fresh = counters.env_steps % settings.epoch_steps == 0
-        if state.bandit is not None:
-            counts = fresh & (counters.env_steps > settings.first_learning_step) & (state.epoch_episodes > 0)
-            mean_return = state.epoch_return / jnp.maximum(state.epoch_episodes, 1)
-            drawn = mixture.end_round(state.bandit, settings, mean_return, key)
-            state = state.replace(bandit=jax.tree.map(partial(jnp.where, counts), drawn, state.bandit))
-
-        def cleared(tree):
-            return jax.tree.map(lambda x: jnp.where(fresh, jnp.zeros_like(x), x), tree)
-
-        return state.replace(
-            agents=state.agents.replace(stats=cleared(state.agents.stats)),
-            epoch_return=cleared(state.epoch_return),
-            epoch_episodes=cleared(state.epoch_episodes),
-        )
-
-    def fit_models(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
-        """Refits every model on D_E (Algorithm 1, line 2) where `enabled`."""
-        settings, spec = self.settings, self.spec
-        split_key, fit_key = jax.random.split(key)
-        rows = counters.env_steps
-        split = dynamics.Split.draw(split_key, rows, settings.replay_capacity, settings.validation_block)
-        whitening = dynamics.scaling(state.moments, rows)
-
-        def fit(model, key):
-            return dynamics.fit(model, state.real, split, whitening, state.hyper, key, settings=settings, spec=spec)
-
-        keys = self.layout.keys(fit_key, self.layout.model_ids())
-        # Only the models go through the branch: see `drivers.observe_and_learn`.
-        fitted = jax.lax.cond(
-            enabled, lambda models: self.layout.map_local(fit, models, keys), lambda x: x, state.models
-        )
-        return state.replace(models=fitted)
+    def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
+        """Refits the models and renews the imagined data (Algorithm 1, lines 2, 9 and 10)."""
+        fit_key, imagine_key = jax.random.split(key)
+        state = self.fit_models(counters, state, enabled, fit_key)
+        return self.imagine(counters, state, enabled, imagine_key)
 
     def imagine(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Rolls every member (n, m) out in model n from real states (lines 9 and 10), into its own ring.
@@ -279,11 +145,3 @@ class PsMbpo:
         from_real = jax.random.uniform(source_key, shape) < self.real_ratio(counters, state)
         rows = jnp.where(from_real[..., None], state.real[real_index], imagined[imagined_index])
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
-
-
-def _welford(moments: Moments, transition: Transition, rows: jax.Array) -> Moments:
-    """Moments of one more row after `rows` of them."""
-    value = jnp.concatenate([transition.obs, transition.action])
-    change = value - moments.mean
-    mean = moments.mean + change / (rows + 1)
-    return Moments(mean=mean, deviation=moments.deviation + change * (value - mean))

@@ -1,0 +1,203 @@
+"""What every algorithm does: keep the real data, the models and the episodes, and decide who acts.
+
+Everything here runs inside `layout.Layout.spread`: models and agents are this device's share, [N_local, ...] and
+[P_local, ...]. `counters` are shared by all seeds.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from vecpsmbpo import dynamics, imagination, mixture, posterior, replay
+from vecpsmbpo.layout import Layout
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import Counters, EnvSpec, Episode, EpisodeEnd, Hyper, Moments, SeedState, Transition
+
+
+@dataclass(frozen=True)
+class Algorithm(ABC):
+    """An algorithm's functions over fixed shapes, for one seed."""
+
+    settings: Settings
+    spec: EnvSpec
+    layout: Layout
+
+    # ── what an algorithm adds ───────────────────────────────────────────────────────────────────────────────
+
+    @abstractmethod
+    def init_agent(self, key: jax.Array) -> Any:
+        """One member; its sums over an epoch are in its `stats` (`types.AgentStats`)."""
+
+    @abstractmethod
+    def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+        """The acting member's action [A] for obs [O], and what it will remember at the episode's next step."""
+
+    @abstractmethod
+    def evaluation_policy(self, state: SeedState, key: jax.Array) -> Any:
+        """What `act_greedily` needs of the state."""
+
+    @abstractmethod
+    def act_greedily(
+        self, policy: Any, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, Any]:
+        """The evaluation's action [A] for obs [O] at a step of the episode, from 0, and what it will remember."""
+
+    @abstractmethod
+    def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
+        """What happens where a period of `model_update_every` steps begins; nothing where not `enabled`."""
+
+    def memory(self) -> Any:
+        """What is remembered when an episode begins."""
+        return ()
+
+    def imagined_rows(self, counters: Counters, enabled: jax.Array) -> jax.Array:
+        """The counter of `counters` after `refresh`."""
+        return counters.imagined_rows
+
+    def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Any:
+        """The agents after what is learned at every step."""
+        return state.agents
+
+    # ── init ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+    def init(self, key: jax.Array, hyper: Hyper) -> SeedState:
+        """The state before the first step. The first episode is a warm-up episode."""
+        settings, spec, layout = self.settings, self.spec, self.layout
+        key, model_key, agent_key, draw_key = jax.random.split(key, 4)
+        members = posterior.init(settings.n_members)
+        size = spec.obs_size + spec.action_size
+        ring = replay.init(imagination.ring_capacity(settings), spec.obs_size, spec.action_size)
+        return SeedState(
+            key=key,
+            hyper=hyper,
+            models=jax.vmap(lambda k: dynamics.init(k, hyper, settings, spec))(
+                layout.keys(model_key, layout.model_ids())
+            ),
+            agents=jax.vmap(self.init_agent)(layout.keys(agent_key, layout.member_ids())),
+            real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
+            imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
+            moments=Moments(mean=jnp.zeros(size), deviation=jnp.zeros(size)),
+            posterior=members,
+            episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
+            memory=self.memory(),
+            bandit=mixture.init(settings, jax.random.fold_in(draw_key, 2)) if settings.adapts_real_ratio else None,
+            epoch_return=jnp.zeros(()),
+            epoch_episodes=jnp.zeros(()),
+        )
+
+    # ── act ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+    def act(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+        """The running episode's action, uniform in a random episode, and what is to be remembered.
+
+        Shapes: obs [O] -> action [A].
+        """
+        policy_key, uniform_key = jax.random.split(key)
+        action, memory = self.choose(counters, state, obs, policy_key)
+        uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0, maxval=1.0)
+        return jnp.where(state.episode.random, uniform, action), memory
+
+    # ── observe ──────────────────────────────────────────────────────────────────────────────────────────────
+
+    def observe(
+        self,
+        counters: Counters,
+        state: SeedState,
+        transition: Transition,
+        truncated: jax.Array,
+        key: jax.Array,
+    ) -> tuple[SeedState, EpisodeEnd]:
+        """Stores a real transition; where it ends the episode, credits the member and draws the next one."""
+        episode = state.episode
+        total = episode.episode_return + transition.reward
+        length = episode.length + 1
+        terminated = transition.terminated > 0
+        done = terminated | truncated
+        end = EpisodeEnd(
+            done=done,
+            index=episode.index,
+            member=episode.member,
+            random=episode.random,
+            terminated=terminated,
+            episode_return=total,
+            length=length,
+            probs=episode.probs,
+        )
+        members = posterior.credit(state.posterior, episode.member, total, done & ~episode.random)
+        random = counters.env_steps + 1 < self.settings.warmup_steps
+        following = self._begin_episode(members, state.hyper, episode.index + 1, random, key)
+        running = episode.replace(episode_return=total, length=length)
+        state = state.replace(
+            real=replay.add(state.real, replay.pack(transition)[None], counters.env_steps),
+            moments=_welford(state.moments, transition, counters.env_steps),
+            posterior=members,
+            episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
+            memory=jax.tree.map(partial(jnp.where, done), self.memory(), state.memory),
+            epoch_return=state.epoch_return + jnp.where(done, total, 0.0),
+            epoch_episodes=state.epoch_episodes + done,
+        )
+        return state, end
+
+    def _begin_episode(self, members, hyper: Hyper, index, random, key: jax.Array) -> Episode:
+        member, probs = posterior.draw(members, hyper.temperature, key)
+        if self.settings.posterior == "average":
+            member = jnp.int32(-1)
+        explores = posterior.exploration_probability(hyper.forced_exploration, index)
+        random |= jax.random.bernoulli(jax.random.fold_in(key, 1), explores)
+        zero = jnp.zeros(())
+        return Episode(index, member, random, probs, episode_return=zero, length=jnp.int32(0))
+
+    # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
+
+    def real_ratio(self, counters: Counters, state: SeedState) -> jax.Array:
+        """λ now, []."""
+        return mixture.real_ratio(self.settings, state.hyper, state.bandit, counters.env_steps)
+
+    def begin_epoch(self, counters: Counters, state: SeedState, key: jax.Array) -> SeedState:
+        """Clears the epoch's sums when an epoch begins, and lets the bandit, if there is one, draw λ anew."""
+        settings = self.settings
+        fresh = counters.env_steps % settings.epoch_steps == 0
+        if state.bandit is not None:
+            counts = fresh & (counters.env_steps > settings.first_learning_step) & (state.epoch_episodes > 0)
+            mean_return = state.epoch_return / jnp.maximum(state.epoch_episodes, 1)
+            drawn = mixture.end_round(state.bandit, settings, mean_return, key)
+            state = state.replace(bandit=jax.tree.map(partial(jnp.where, counts), drawn, state.bandit))
+
+        def cleared(tree):
+            return jax.tree.map(lambda x: jnp.where(fresh, jnp.zeros_like(x), x), tree)
+
+        return state.replace(
+            agents=state.agents.replace(stats=cleared(state.agents.stats)),
+            epoch_return=cleared(state.epoch_return),
+            epoch_episodes=cleared(state.epoch_episodes),
+        )
+
+    def fit_models(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
+        """Refits every model on D_E (Algorithm 1, line 2) where `enabled`."""
+        settings, spec = self.settings, self.spec
+        split_key, fit_key = jax.random.split(key)
+        rows = counters.env_steps
+        split = dynamics.Split.draw(split_key, rows, settings.replay_capacity, settings.validation_block)
+        whitening = dynamics.scaling(state.moments, rows)
+
+        def fit(model, key):
+            return dynamics.fit(model, state.real, split, whitening, state.hyper, key, settings=settings, spec=spec)
+
+        keys = self.layout.keys(fit_key, self.layout.model_ids())
+        # Only the models go through the branch: see `drivers.observe_and_learn`.
+        fitted = jax.lax.cond(
+            enabled, lambda models: self.layout.map_local(fit, models, keys), lambda x: x, state.models
+        )
+        return state.replace(models=fitted)
+
+
+def _welford(moments: Moments, transition: Transition, rows: jax.Array) -> Moments:
+    """Moments of one more row after `rows` of them."""
+    value = jnp.concatenate([transition.obs, transition.action])
+    change = value - moments.mean
+    mean = moments.mean + change / (rows + 1)
+    return Moments(mean=mean, deviation=moments.deviation + change * (value - mean))

@@ -1,0 +1,60 @@
+"""PETS (Chua et al., 2018) for one seed: no policy; every action is planned in the N models."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from vecpsmbpo import planning
+from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.types import AgentStats, Counters, Model, Planner, SeedState
+
+
+class Pets(Algorithm):
+    """Model-predictive control; an episode remembers its plan, from which the next one starts."""
+
+    def init_agent(self, key: jax.Array) -> Planner:
+        return Planner(stats=AgentStats.zero())
+
+    def memory(self) -> jax.Array:
+        """The plan [H, A], whose first action is taken now: of the middle of every range."""
+        return jnp.zeros((self.settings.plan_horizon, self.spec.action_size))
+
+    def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+        """The first action of the plan. Nothing is planned during the warm-up, when actions are random."""
+        steps = counters.env_steps
+        due = (steps % self.settings.plan_hold == 0) & (steps >= self.settings.warmup_steps)
+        return self._follow(due, self.layout.all_models(state.models), state.memory, obs, key)
+
+    def evaluation_policy(self, state: SeedState, key: jax.Array) -> Model:
+        return self.layout.all_models(state.models)
+
+    def act_greedily(
+        self, policy: Model, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, Any]:
+        """As `choose`: planning is the same in training and evaluation."""
+        return self._follow(step % self.settings.plan_hold == 0, policy, memory, obs, key)
+
+    def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
+        return self.fit_models(counters, state, enabled, key)
+
+    def _follow(
+        self, due: jax.Array, models: Model, plan: jax.Array, obs: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """The action for obs [O] and the plan [H, A]; a new one where `due`, which must not be batched over seeds or
+        episodes: a batched condition would plan always."""
+        settings, spec, layout = self.settings, self.spec, self.layout
+
+        def value(plans, key):
+            def part(plans, ids):
+                keys = jax.random.fold_in(key, ids[0])
+                return planning.expected_returns(models, obs, plans, keys, settings=settings, spec=spec)
+
+            return layout.share(part, plans)
+
+        def anew(plan):
+            shifted = jnp.concatenate([plan[1:], jnp.zeros_like(plan[:1])])
+            return planning.cross_entropy(value, shifted, key, settings)
+
+        plan = jax.lax.cond(due, anew, lambda plan: plan, plan)
+        return plan[0], plan
