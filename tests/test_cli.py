@@ -11,7 +11,8 @@ import hydra
 import pytest
 
 from tests.helpers import command, environment
-from vecpsmbpo import config
+from vecpsmbpo import cli, config
+from vecpsmbpo.envs.registry import TASKS
 from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, allowed, check
 
 MISTAKES = [
@@ -87,6 +88,14 @@ def test_help_and_envs_answer_without_jax(arguments, tmp_path):
     )
     assert result.returncode == 0, result.stderr
     assert "hopper" in result.stdout
+
+
+def test_envs_names_every_task_and_the_extra_that_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr("vecpsmbpo.envs.registry.Task.installed", property(lambda task: task.extra == ""))
+    assert cli.main(["envs"]) == 0
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert [line.split()[0] for line in lines] == list(TASKS)
+    assert next(line for line in lines if "pip install 'vecpsmbpo[playground]'" in line).split()[0] == "playground"
 
 
 def test_too_little_memory_is_said_before_anything_is_allocated(tmp_path):

@@ -112,6 +112,7 @@ def _envs(rest: list[str]) -> int:
     if rest:
         raise SettingError(f"{rest[0]}: envs takes no arguments")
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from vecpsmbpo import config
@@ -122,8 +123,9 @@ def _envs(rest: list[str]) -> int:
         sizes = map(str, task.sizes) if task.sizes else ("any", "any", "its own")
         options = " ".join(f"env.{option}" for option in config.env_options(name))
         installed = "yes" if task.installed else f"no: pip install 'vecpsmbpo[{task.extra}]'" if task.extra else "no"
+        installed = escape(installed)  # rich would read [playground] as markup
         table.add_row(name, ", ".join(task.backends), *sizes, options, task.suite, installed)
-    Console(width=120).print(table)
+    Console(width=150).print(table)
     return 0
 
 
