@@ -1,6 +1,7 @@
 """ONE dynamics model: loss (equation 17), fit with early stopping, prediction (equations 20 and 21)."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -107,7 +108,22 @@ def predict(
     prediction = forward(model, obs, action, net=net)
     noise = jax.random.normal(key, prediction.mean.shape)
     sample = prediction.mean + jnp.exp(0.5 * prediction.log_variance) * noise
-    next_obs, reward = obs + sample[..., :-1], sample[..., -1]
+    return _successor(prediction, sample, obs, action, key, spec)
+
+
+def predict_mean(
+    model: Model, obs: jax.Array, action: jax.Array, key: jax.Array, *, net: networks.GaussianMLP, spec: EnvSpec
+) -> Successor:
+    """As `predict`, with the mean of (s', r); a learned end of the episode is drawn all the same."""
+    prediction = forward(model, obs, action, net=net)
+    return _successor(prediction, prediction.mean, obs, action, key, spec)
+
+
+def _successor(
+    prediction: networks.Prediction, change: jax.Array, obs: jax.Array, action: jax.Array, key: jax.Array, spec: EnvSpec
+) -> Successor:
+    """change: (Δs, r) [..., O + 1]."""
+    next_obs, reward = obs + change[..., :-1], change[..., -1]
     if spec.terminated is None:
         probability = jax.nn.sigmoid(prediction.logit)
         return Successor(next_obs, reward, jax.random.bernoulli(jax.random.fold_in(key, 1), probability))
@@ -186,8 +202,7 @@ def fit(
         batch = rows_of(split.train_rows(key, settings.model_batch_size, block))
         objective = lambda params: loss(model.replace(params=params), batch, net=net)  # noqa: E731
         value, gradient = jax.value_and_grad(objective)(params)
-        # L2 in the gradient, as torch's Adam(weight_decay) of both MBPO codebases has it.
-        gradient = jax.tree.map(lambda g, p: g + hyper.model_weight_decay * p, gradient, params)
+        gradient = jax.tree.map(partial(optim.with_decay, hyper.model_weight_decay), gradient, params)
         return *optim.step(gradient, optimizer, params, hyper.model_learning_rate), value
 
     def validate(params: Params) -> jax.Array:

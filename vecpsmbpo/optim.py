@@ -11,6 +11,11 @@ _adam = optax.scale_by_adam()
 init = _adam.init
 
 
+def with_decay(decay: jax.Array, gradient: jax.Array, param: jax.Array) -> jax.Array:
+    """L2 in the gradient, as torch's Adam(weight_decay) of both MBPO codebases has it."""
+    return gradient + decay * param
+
+
 def step(gradient: Params, optimizer: Any, params: Params, rate: jax.Array) -> tuple[Params, Any]:
     """The parameters one Adam step further, and the optimizer's new state."""
     direction, optimizer = _adam.update(gradient, optimizer)

@@ -95,11 +95,19 @@ class Rates(NamedTuple):
     def over(cls, settings: Settings, env_steps: int, steps: int, seconds: float) -> "Rates":
         """Of the `steps` steps that ended at `env_steps` and took `seconds`."""
         learning = np.arange(max(env_steps - steps, settings.first_learning_step), env_steps)
-        updates = len(learning) * settings.updates_per_step * settings.n_members
-        imagined = 0
-        if settings.real_ratio < 1:
-            refreshes = jnp.asarray(learning[learning % settings.model_update_every == 0])
-            imagined = int(np.sum(imagination.rows_per_refresh(settings, refreshes))) * settings.n_members
+        refreshes = learning[learning % settings.model_update_every == 0]
+        updates = imagined = 0
+        if settings.plans:
+            rollouts = settings.plan_population * settings.plan_iterations * settings.plan_particles
+            imagined = len(learning) * rollouts * settings.plan_horizon
+        elif settings.alternates:
+            updates = len(refreshes) * settings.rounds * settings.policy_steps
+            imagined = updates * settings.policy_rollouts * settings.policy_rollout_length
+        else:
+            updates = len(learning) * settings.updates_per_step * settings.n_members
+            if settings.real_ratio < 1:
+                rows = imagination.rows_per_refresh(settings, jnp.asarray(refreshes))
+                imagined = int(np.sum(rows)) * settings.n_members
         return cls(*(len(settings.lanes) * count / seconds for count in (steps, updates, imagined)))
 
 

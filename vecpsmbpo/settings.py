@@ -88,6 +88,16 @@ class Settings:
     discount: float = _real(0, 1)
     target_entropy: float = _real()
     target_update_rate: float = _real(0, 1, open_low=True)
+    # model and policy in turns (SLBO)
+    rounds: int = _whole(1)
+    model_steps: int = _whole(1)
+    model_steps_ahead: int = _whole(1)
+    policy_steps: int = _whole(1)
+    policy_rollouts: int = _whole(1)
+    policy_rollout_length: int = _whole(1)
+    trust_region: float = _real(0, open_low=True)
+    gae_decay: float = _real(0, 1)
+    entropy_weight: float = _real(0)
     # plans (PETS)
     plan_horizon: int = _whole(1)
     plan_hold: int = _whole(1)
@@ -112,6 +122,11 @@ class Settings:
     def n_members(self) -> int:
         """The policies that the posterior draws from: N·M, or M where none belongs to a model."""
         return self.n_policies * (self.n_models if self.rollout_models == "own" and not self.plans else 1)
+
+    @property
+    def alternates(self) -> bool:
+        """Whether one model and one policy learn in turns, at refreshes only."""
+        return self.algo == "slbo"
 
     @property
     def plans(self) -> bool:
@@ -278,6 +293,8 @@ def build(values: Mapping[str, Any]) -> Settings:
         raise SettingError(
             f"warmup_steps={settings.warmup_steps}: must be at least 1 / validation_ratio = {settings.validation_block}"
         )
+    if settings.alternates and (settings.n_models, settings.n_policies) != (1, 1):
+        raise SettingError("n_models, n_policies: must be 1 with algo=slbo, which has one model and one policy")
     if settings.plan_elites > settings.plan_population:
         raise SettingError(f"plan_elites={settings.plan_elites}: must be at most plan_population")
     if settings.plans and settings.plan_particles % settings.n_models:

@@ -3,6 +3,7 @@
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.pets import Pets
 from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
+from vecpsmbpo.algorithms.slbo import Slbo
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EnvSpec
@@ -10,5 +11,5 @@ from vecpsmbpo.types import EnvSpec
 
 def make(settings: Settings, spec: EnvSpec) -> Algorithm:
     """The algorithm that `algo=` names, on this process's devices."""
-    chosen = Pets if settings.plans else PsMbpo
+    chosen = Pets if settings.plans else Slbo if settings.alternates else PsMbpo
     return chosen(settings, spec, Layout.of(settings))

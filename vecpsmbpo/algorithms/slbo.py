@@ -1,0 +1,94 @@
+"""SLBO (Luo et al., 2019) for one seed: one model and one policy, which learn in turns at every refresh."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from vecpsmbpo import dynamics, imagination, multistep, trpo
+from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.types import Counters, Model, Params, SeedState
+
+
+class Slbo(Algorithm):
+    """The policy learns by TRPO from rollouts in the model, which goes on learning meanwhile."""
+
+    def init_agent(self, key: jax.Array) -> trpo.TrpoAgent:
+        return trpo.init(key, self._nets, self.spec)
+
+    def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+        """A sample of the policy, clipped."""
+        sample = lambda params: self._nets.policy.law(params, obs).sample(key)  # noqa: E731
+        return jnp.clip(self.layout.ask(state.episode.member, state.agents.policy, sample), -1.0, 1.0), ()
+
+    def evaluation_policy(self, state: SeedState, key: jax.Array) -> Params:
+        return self.layout.ask(jnp.int32(0), state.agents.policy)
+
+    def act_greedily(
+        self, policy: Params, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, Any]:
+        """Mean action."""
+        return jnp.clip(self._nets.policy.law(policy, obs).loc, -1.0, 1.0), ()
+
+    def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
+        """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""
+        layout, rows = self.layout, counters.env_steps
+        whitening = dynamics.scaling(state.moments, rows)
+
+        def round_(learned, key):
+            model, agent = learned
+            model_key, policy_key = jax.random.split(key)
+            model = multistep.fit(
+                model, state.real, rows, state.hyper, model_key, settings=self.settings, spec=self.spec
+            )
+
+            def policy_step(agent, key):
+                rollout_key, update_key = jax.random.split(key)
+                rollouts = self.rollouts(counters, state.real, model, agent.policy, rollout_key)
+                discount = state.hyper.discount
+                return trpo.update(agent, rollouts, discount, update_key, settings=self.settings, nets=self._nets), None
+
+            agent, _ = jax.lax.scan(policy_step, agent, jax.random.split(policy_key, self.settings.policy_steps))
+            return (model, agent), None
+
+        def learn(model, agent, key):
+            model = model.replace(input_mean=whitening[0], input_std=whitening[1])
+            return jax.lax.scan(round_, (model, agent), jax.random.split(key, self.settings.rounds))[0]
+
+        def learned(models, agents):
+            return layout.map_local(learn, models, agents, layout.keys(key, layout.member_ids()))
+
+        models, agents = jax.lax.cond(enabled, learned, lambda *same: same, state.models, state.agents)
+        return state.replace(models=models, agents=agents)
+
+    def rollouts(
+        self, counters: Counters, real: jax.Array, model: Model, policy: Params, key: jax.Array
+    ) -> trpo.Rollouts:
+        """Rollouts of the policy in the model's mean, from real states; one that terminates begins again from another.
+
+        SLBO's code starts them from the environment's initial states, which a model cannot draw.
+        """
+        settings, spec = self.settings, self.spec
+        net, count, length = dynamics.network(settings, spec), settings.policy_rollouts, settings.policy_rollout_length
+
+        def real_states(key):
+            return imagination.start_states(real, counters.env_steps, key, count, spec)
+
+        def step(obs, xs):
+            t, key = xs
+            action_key, model_key, fresh_key = jax.random.split(key, 3)
+            action = self._nets.policy.law(policy, obs).sample(action_key)
+            answer = dynamics.predict_mean(model, obs, jnp.clip(action, -1.0, 1.0), model_key, net=net, spec=spec)
+            ended = answer.terminated | (t == length - 1)
+            row = trpo.Rollouts(
+                obs, action, answer.reward, answer.next_obs, answer.terminated.astype(jnp.float32), ended
+            )
+            return jnp.where(answer.terminated[:, None], real_states(fresh_key), answer.next_obs), row
+
+        start_key, step_key = jax.random.split(key)
+        xs = jnp.arange(length), jax.random.split(step_key, length)
+        return jax.lax.scan(step, real_states(start_key), xs)[1]
+
+    @property
+    def _nets(self) -> trpo.Networks:
+        return trpo.make_networks(self.settings, self.spec)

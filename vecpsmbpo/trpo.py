@@ -1,0 +1,187 @@
+"""ONE policy learned by trust-region policy optimization (Schulman et al., 2015), with GAE (the same, 2016)."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax.flatten_util import ravel_pytree
+from jax.scipy.sparse.linalg import cg
+
+from vecpsmbpo import networks, optim
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import AgentStats, EnvSpec, Params
+
+DAMPING = 0.1  # added to the Fisher matrix
+CG_ITERATIONS = 10
+LINE_SEARCH_STEPS = 10  # each half as long as the one before
+VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 20, 256, 1e-3  # of Adam, after each step of the policy
+
+
+class TrpoAgent(struct.PyTreeNode):
+    """Policy and value function; Adam's state of the latter."""
+
+    policy: Params
+    value: Params
+    value_optimizer: Any
+    stats: AgentStats
+
+
+class Rollouts(NamedTuple):
+    """T steps of B rollouts, in order.
+
+    Attributes:
+        obs, next_obs: [T, B, O]; action [T, B, A], before it is clipped.
+        reward, terminated: [T, B].
+        ended: [T, B] bool, the row after this one belongs to another rollout.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    next_obs: jax.Array
+    terminated: jax.Array
+    ended: jax.Array
+
+
+class Networks(NamedTuple):
+    policy: networks.GaussianPolicy
+    value: networks.TanhMLP
+
+
+def make_networks(settings: Settings, spec: EnvSpec) -> Networks:
+    size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
+    return Networks(networks.GaussianPolicy(spec.action_size, size, layers), networks.TanhMLP(1, size, layers))
+
+
+def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> TrpoAgent:
+    policy_key, value_key = jax.random.split(key)
+    obs = jnp.zeros(spec.obs_size)
+    value = nets.value.init(value_key, obs)
+    return TrpoAgent(nets.policy.init(policy_key, obs), value, optim.init(value), AgentStats.zero())
+
+
+def advantages(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    ended: jax.Array,
+    discount: jax.Array,
+    decay: float,
+) -> jax.Array:
+    """Generalized advantages Σ_l (γ λ)^l δ_{t+l} within a rollout, where δ = r + γ (1 - terminated) V(s') - V(s).
+
+    All [T, B].
+    """
+    delta = reward + discount * (1 - terminated) * next_value - value
+
+    def backwards(following, xs):
+        delta, ended = xs
+        advantage = delta + discount * decay * (1 - ended) * following
+        return advantage, advantage
+
+    return jax.lax.scan(backwards, jnp.zeros_like(delta[0]), (delta, ended.astype(delta.dtype)), reverse=True)[1]
+
+
+def surrogate(
+    policy: Params, old_log_prob: jax.Array, rows: Any, entropy_weight: float, *, nets: Networks
+) -> jax.Array:
+    """E[π / π_old · advantage] and the entropy bonus. rows: (obs [K, O], action [K, A], advantage [K])."""
+    obs, action, advantage = rows
+    law = nets.policy.law(policy, obs)
+    ratio = jnp.exp(law.log_prob(action) - old_log_prob)
+    return jnp.mean(ratio * advantage) + entropy_weight * jnp.mean(law.entropy())
+
+
+def divergence(policy: Params, old: Params, obs: jax.Array, *, nets: Networks) -> jax.Array:
+    """Mean KL(π_old || π) over obs [K, O]."""
+    return jnp.mean(nets.policy.law(old, obs).divergence_to(nets.policy.law(policy, obs)))
+
+
+def natural_direction(policy: Params, gradient: jax.Array, obs: jax.Array, *, nets: Networks) -> tuple[Any, Any]:
+    """(F + damping)⁻¹ gradient by conjugate gradients, and F + damping as a function; F is the Hessian of the KL.
+
+    Args:
+        gradient: flat, [D].
+    """
+    flat, unravel = ravel_pytree(policy)
+    slope = jax.grad(lambda x: divergence(unravel(x), policy, obs, nets=nets))
+
+    def fisher(vector):
+        return jax.jvp(slope, (flat,), (vector,))[1] + DAMPING * vector
+
+    return cg(fisher, gradient, maxiter=CG_ITERATIONS, tol=1e-8)[0], fisher
+
+
+def policy_step(
+    policy: Params, rows: Any, *, trust_region: float, entropy_weight: float, nets: Networks
+) -> tuple[Params, jax.Array]:
+    """The policy after one step that improves the surrogate and stays within the trust region, or the same policy where
+    no step of the line search does; and by how much the surrogate grew.
+
+    Args:
+        rows: obs [K, O], action [K, A], advantage [K].
+    """
+    flat, unravel = ravel_pytree(policy)
+    old_log_prob = nets.policy.law(policy, rows[0]).log_prob(rows[1])
+
+    def objective(x):
+        return surrogate(unravel(x), old_log_prob, rows, entropy_weight, nets=nets)
+
+    before, gradient = jax.value_and_grad(objective)(flat)
+    direction, fisher = natural_direction(policy, gradient, rows[0], nets=nets)
+    longest = jnp.sqrt(2 * trust_region / jnp.maximum(direction @ fisher(direction), 1e-10))
+
+    def candidate(step):
+        return flat + 0.5**step * longest * direction
+
+    def fails(x):
+        too_far = divergence(unravel(x), policy, rows[0], nets=nets) > trust_region
+        return too_far | ~(objective(x) > before)
+
+    steps = jax.lax.while_loop(
+        lambda step: (step < LINE_SEARCH_STEPS) & fails(candidate(step)), lambda step: step + 1, 0
+    )
+    chosen = jnp.where(steps < LINE_SEARCH_STEPS, candidate(steps), flat)
+    return unravel(chosen), objective(chosen) - before
+
+
+def update(
+    agent: TrpoAgent, rollouts: Rollouts, discount: jax.Array, key: jax.Array, *, settings: Settings, nets: Networks
+) -> TrpoAgent:
+    """One step of the policy, and the value function refitted to the rollouts' returns."""
+    value_of = lambda params, obs: nets.value.apply(params, obs)[..., 0]  # type: ignore[index]  # noqa: E731
+    value, next_value = value_of(agent.value, rollouts.obs), value_of(agent.value, rollouts.next_obs)
+    advantage = advantages(
+        rollouts.reward, value, next_value, rollouts.terminated, rollouts.ended, discount, settings.gae_decay
+    )
+    flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
+    obs, target = flat(rollouts.obs), flat(advantage + value)
+    scaled = (flat(advantage) - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+    policy, gain = policy_step(
+        agent.policy,
+        (obs, flat(rollouts.action), scaled),
+        trust_region=settings.trust_region,
+        entropy_weight=settings.entropy_weight,
+        nets=nets,
+    )
+
+    def value_step(carry, key):
+        params, optimizer = carry
+        chosen = jax.random.randint(key, (VALUE_BATCH,), 0, obs.shape[0])
+        error = lambda params: jnp.mean((value_of(params, obs[chosen]) - target[chosen]) ** 2)  # noqa: E731
+        loss, gradient = jax.value_and_grad(error)(params)
+        return optim.step(gradient, optimizer, params, VALUE_RATE), loss
+
+    start = agent.value, agent.value_optimizer
+    (fitted, optimizer), losses = jax.lax.scan(value_step, start, jax.random.split(key, VALUE_STEPS))
+    news = AgentStats(
+        updates=jnp.ones(()),
+        critic_loss=jnp.mean(losses),
+        actor_loss=-gain,
+        alpha=jnp.zeros(()),
+        q_mean=jnp.mean(value),
+        entropy=jnp.mean(nets.policy.law(policy, obs).entropy()),
+    )
+    return TrpoAgent(policy, fitted, optimizer, jax.tree.map(jnp.add, agent.stats, news))
