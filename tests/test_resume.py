@@ -102,9 +102,10 @@ def test_a_signal_saves_and_says_how_to_go_on(undisturbed, tmp_path):
     assert_same_run(tmp_path / "run", undisturbed)
 
 
-def test_a_host_run_resumes_exactly(tmp_path):
+@pytest.mark.parametrize("algo", ["ops_mbpo", "pets", "slbo"])
+def test_a_host_run_resumes_exactly(algo, tmp_path):
     """The simulator's state is in the checkpoint: 120 steps at once equal 80 and then 40."""
-    common = ["env=hopper", "backend=host", "size=tiny"]
+    common = ["env=hopper", "backend=host", "size=tiny", f"algo={algo}"]
     for folder, budgets in (("once", [120]), ("twice", [80, 120])):
         for total in budgets:
             arguments = ["train", *common, f"run_dir={folder}", f"total_steps={total}"]

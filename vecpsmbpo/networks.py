@@ -188,3 +188,20 @@ class GaussianPolicy(nn.Module):
         """π(· | obs) of these parameters."""
         law: Any = self.apply(params, obs)
         return law
+
+
+class StateValue(nn.Module):
+    """V(s)."""
+
+    hidden_size: int
+    hidden_layers: int
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        """obs [..., O] -> [...]."""
+        return TanhMLP(1, self.hidden_size, self.hidden_layers)(obs)[..., 0]
+
+    def values(self, params: Params, obs: jax.Array) -> jax.Array:
+        """V [...] of these parameters."""
+        values: Any = self.apply(params, obs)
+        return values

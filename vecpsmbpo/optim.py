@@ -16,7 +16,7 @@ def with_decay(decay: jax.Array, gradient: jax.Array, param: jax.Array) -> jax.A
     return gradient + decay * param
 
 
-def step(gradient: Params, optimizer: Any, params: Params, rate: jax.Array) -> tuple[Params, Any]:
+def step(gradient: Params, optimizer: Any, params: Params, rate: jax.Array | float) -> tuple[Params, Any]:
     """The parameters one Adam step further, and the optimizer's new state."""
     direction, optimizer = _adam.update(gradient, optimizer)
     return jax.tree.map(lambda p, d: p - rate * d, params, direction), optimizer

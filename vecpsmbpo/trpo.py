@@ -46,12 +46,12 @@ class Rollouts(NamedTuple):
 
 class Networks(NamedTuple):
     policy: networks.GaussianPolicy
-    value: networks.TanhMLP
+    value: networks.StateValue
 
 
 def make_networks(settings: Settings, spec: EnvSpec) -> Networks:
     size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
-    return Networks(networks.GaussianPolicy(spec.action_size, size, layers), networks.TanhMLP(1, size, layers))
+    return Networks(networks.GaussianPolicy(spec.action_size, size, layers), networks.StateValue(size, layers))
 
 
 def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> TrpoAgent:
@@ -151,8 +151,7 @@ def update(
     agent: TrpoAgent, rollouts: Rollouts, discount: jax.Array, key: jax.Array, *, settings: Settings, nets: Networks
 ) -> TrpoAgent:
     """One step of the policy, and the value function refitted to the rollouts' returns."""
-    value_of = lambda params, obs: nets.value.apply(params, obs)[..., 0]  # type: ignore[index]  # noqa: E731
-    value, next_value = value_of(agent.value, rollouts.obs), value_of(agent.value, rollouts.next_obs)
+    value, next_value = (nets.value.values(agent.value, obs) for obs in (rollouts.obs, rollouts.next_obs))
     advantage = advantages(
         rollouts.reward, value, next_value, rollouts.terminated, rollouts.ended, discount, settings.gae_decay
     )
@@ -170,7 +169,7 @@ def update(
     def value_step(carry, key):
         params, optimizer = carry
         chosen = jax.random.randint(key, (VALUE_BATCH,), 0, obs.shape[0])
-        error = lambda params: jnp.mean((value_of(params, obs[chosen]) - target[chosen]) ** 2)  # noqa: E731
+        error = lambda params: jnp.mean((nets.value.values(params, obs[chosen]) - target[chosen]) ** 2)  # noqa: E731
         loss, gradient = jax.value_and_grad(error)(params)
         return optim.step(gradient, optimizer, params, VALUE_RATE), loss
 

@@ -222,7 +222,7 @@ class SeedState(struct.PyTreeNode):
         key: typed PRNG key.
         hyper: see `Hyper`.
         models: `Model` with leading [N].
-        agents: `Agent` with leading [P].
+        agents: `Agent`, or what another algorithm has for it, with leading [P].
         real: [C, F], D_E: packed transitions, a ring.
         imagined: [P, C_M, F], D_M^{n,m}: one ring per member.
         moments: of D_E, for whitening.
@@ -235,7 +235,7 @@ class SeedState(struct.PyTreeNode):
     key: jax.Array
     hyper: Hyper
     models: Model
-    agents: Agent
+    agents: Any
     real: jax.Array
     imagined: jax.Array
     moments: Moments
