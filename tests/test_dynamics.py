@@ -10,7 +10,7 @@ import pytest
 
 from tests.helpers import tiny
 from vecpsmbpo import dynamics, replay
-from vecpsmbpo.types import EnvSpec, Hyper, Moments, Transition
+from vecpsmbpo.types import EnvSpec, Hyper, Moments, Scaling, Transition
 
 SPEC = EnvSpec("linear", obs_size=2, action_size=1, episode_length=10, terminated=lambda o, a, n: n[..., 0] > 9)
 CAPACITY = 2048
@@ -34,6 +34,11 @@ def linear():
     return settings, rows
 
 
+def _moments(rows):
+    values = jnp.concatenate([rows[:, :3], rows[:, 3:5] - rows[:, :2]], axis=1)
+    return Moments(values.mean(0), ((values - values.mean(0)) ** 2).sum(0), inputs=3)
+
+
 @pytest.fixture(scope="module")
 def fit(linear):
     """The fit as one compiled function of (model, number of rows, key)."""
@@ -42,9 +47,7 @@ def fit(linear):
     @jax.jit
     def run(model, count, key):
         split = dynamics.Split.draw(key, count, CAPACITY, settings.validation_block)
-        inputs = rows[:, :3]
-        moments = Moments(inputs.mean(0), ((inputs - inputs.mean(0)) ** 2).sum(0))
-        whitening = dynamics.scaling(moments, jnp.int32(CAPACITY))
+        whitening = dynamics.scaling(_moments(rows), jnp.int32(CAPACITY), settings)
         hyper = Hyper.of(settings)
         return dynamics.fit(model, rows, split, whitening, hyper, key, settings=settings, spec=SPEC)
 
@@ -78,7 +81,7 @@ def test_the_best_parameters_are_restored(linear, fit, key):
     model = fit(dynamics.init(key, Hyper.of(settings), settings, SPEC), jnp.int32(CAPACITY), key)
     split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
     hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(1.0))
-    whitening = (model.input_mean, model.input_std)
+    whitening = model.scaling
     refit = jax.jit(partial(dynamics.fit, settings=settings, spec=SPEC))
     after = refit(model, rows, split, whitening, hyper, key)
     jax.tree.map(np.testing.assert_array_equal, after.params, model.params)
@@ -118,7 +121,7 @@ def test_where_the_rule_is_not_known_termination_is_learned(linear, key):
     @jax.jit
     def run(key):
         split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
-        whitening = jnp.zeros(3), jnp.ones(3)
+        whitening = Scaling(jnp.zeros(3), jnp.ones(3), jnp.ones(3))
         model = dynamics.init(key, Hyper.of(settings), settings, spec)
         hyper = Hyper.of(settings)
         return dynamics.fit(model, rows, split, whitening, hyper, key, settings=settings, spec=spec)
@@ -134,3 +137,32 @@ def test_where_the_rule_is_not_known_termination_is_learned(linear, key):
     chance = float(jax.nn.sigmoid(dynamics.forward(fitted, border[0], action[0], net=net).logit))
     assert 0.02 < chance < 0.98
     assert float(drawn.mean()) == pytest.approx(chance, abs=4 * np.sqrt(chance * (1 - chance) / 4000))
+
+
+def test_whitened_targets_resolve_changes_that_the_variance_floor_hides(linear, key):
+    """Changes a thousand times smaller than the rows': predicted raw they lie below the floor's deviation of 0.0067
+    and are fitted poorly; in units of their deviation nothing is lost."""
+    settings, rows = linear
+    small = rows.at[:, 3:5].set(rows[:, :2] + 1e-3 * (rows[:, 3:5] - rows[:, :2]))
+    explained = {}
+    for whiten in (False, True):
+        chosen = dataclasses.replace(settings, whiten_targets=whiten, model_patience=5)
+
+        @jax.jit
+        def run(key, chosen=chosen):
+            split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, chosen.validation_block)
+            hyper = Hyper.of(chosen)
+            model = dynamics.init(key, hyper, chosen, SPEC)
+            whitening = dynamics.scaling(_moments(small), jnp.int32(CAPACITY), chosen)
+            return dynamics.fit(model, small, split, whitening, hyper, key, settings=chosen, spec=SPEC)
+
+        fitted = run(key)
+        obs, action = small[:, :2], small[:, 2:3]
+        prediction = dynamics.forward(fitted, obs, action, net=dynamics.network(chosen, SPEC))
+        truth = 1e-3 * jnp.stack([0.5 * action[:, 0], -0.2 * obs[:, 0]], axis=1)
+        error = jnp.mean((prediction.mean[:, :2] - truth) ** 2, axis=0)
+        explained[whiten] = 1 - np.asarray(error / jnp.var(truth, axis=0))
+        if whiten:
+            np.testing.assert_allclose(np.exp(prediction.log_variance[:, :2].mean(0) / 2), 1e-4, rtol=0.6)
+    assert explained[True].min() > 0.95
+    assert explained[False].max() < 0.9

@@ -55,21 +55,23 @@ def test_prediction_adds_the_residual_to_the_state_and_whitens_its_inputs(key):
     assert reward == pytest.approx(spec.obs_size, abs=noise)
 
     # Whitening: inputs (x - μ) / σ of shifted, scaled data are those of the data before.
-    shifted = model.replace(
-        input_mean=jnp.full(model.input_mean.shape, 3.0), input_std=jnp.full(model.input_std.shape, 2.0)
-    )
+    moved = model.scaling._replace(input_mean=jnp.full(size + 2, 3.0), input_std=jnp.full(size + 2, 2.0))
+    shifted = model.replace(scaling=moved)
     plain = dynamics.forward(model, obs, action, net=net)
     moved = dynamics.forward(shifted, 3 + 2 * obs, 3 + 2 * action, net=net)
     np.testing.assert_allclose(plain[0], moved[0], atol=1e-6)
 
 
 def test_whitening_uses_the_data_s_mean_and_standard_deviation():
-    rows = np.random.default_rng(0).normal(5.0, 3.0, size=(40, 2))
+    rows = np.random.default_rng(0).normal(5.0, 3.0, size=(40, 3))
     rows[:, 1] = 7.0  # never varies: left unscaled
-    moments = Moments(jnp.asarray(rows.mean(0)), jnp.asarray(((rows - rows.mean(0)) ** 2).sum(0)))
-    mean, std = dynamics.scaling(moments, jnp.int32(40))
-    np.testing.assert_allclose(mean, rows.mean(0), rtol=1e-5)
+    moments = Moments(jnp.asarray(rows.mean(0)), jnp.asarray(((rows - rows.mean(0)) ** 2).sum(0)), inputs=2)
+    mean, std, changes = dynamics.scaling(moments, jnp.int32(40), tiny())
+    np.testing.assert_allclose(mean, rows.mean(0)[:2], rtol=1e-5)
     np.testing.assert_allclose(std, [rows[:, 0].std(), 1.0], rtol=1e-5)
+    np.testing.assert_array_equal(changes, [1, 1])  # A.1: as they are
+    _, _, changes = dynamics.scaling(moments, jnp.int32(40), tiny(whiten_targets=True))
+    np.testing.assert_allclose(changes, [rows[:, 2].std(), 1.0], rtol=1e-5)
 
 
 def test_optimistic_probabilities_by_hand():

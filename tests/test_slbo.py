@@ -120,7 +120,8 @@ def test_the_multistep_loss_by_hand(key):
     settings = tiny(algo="slbo")
     model = dynamics.init(key, Hyper.of(settings), settings, LINE)
     model = model.replace(
-        params=constant(model.params, jnp.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])), input_std=jnp.array([1.0, 2.0, 1.0])
+        params=constant(model.params, jnp.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])),
+        scaling=model.scaling._replace(input_std=jnp.array([1.0, 2.0, 1.0])),
     )
     obs = jnp.array([[[0.0, 0.0], [1.0, 2.0]]])
     next_obs = jnp.array([[[1.0, 2.0], [5.0, 8.0]]])

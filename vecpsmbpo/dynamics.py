@@ -10,7 +10,7 @@ import optax
 
 from vecpsmbpo import networks, optim, replay
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import EnvSpec, Hyper, Model, Moments, Params, Prior, Transition
+from vecpsmbpo.types import EnvSpec, Hyper, Model, Moments, Params, Prior, Scaling, Transition
 
 VALIDATION_BATCH = 512
 
@@ -66,26 +66,31 @@ def init(key: jax.Array, hyper: Hyper, settings: Settings, spec: EnvSpec) -> Mod
     prior = None
     if settings.has_prior:
         prior = Prior(net.init(jax.random.fold_in(key, 1), jnp.zeros(size)), hyper.prior_scale)
-    return Model(params, optim.init(params), jnp.zeros(size), jnp.ones(size), loss=zero, val_mse=zero, prior=prior)
+    plain = Scaling(jnp.zeros(size), jnp.ones(size), jnp.ones(spec.obs_size + 1))
+    return Model(params, optim.init(params), plain, loss=zero, val_mse=zero, prior=prior)
 
 
-def scaling(moments: Moments, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean and standard deviation [O + A] that whiten the inputs (equation 20).
+def scaling(moments: Moments, rows: jax.Array, settings: Settings) -> Scaling:
+    """What whitens the inputs (equation 20) and, with `whiten_targets`, the changes Δs; rewards stay as they are.
 
-    An input that has never varied is left unscaled: there is nothing to learn from it yet, and dividing by a
-    vanishing deviation would turn its first change into an explosion.
+    What has never varied is left unscaled: there is nothing to learn of it yet, and dividing by a vanishing deviation
+    would turn its first change into an explosion.
     """
     std = jnp.sqrt(moments.deviation / jnp.maximum(rows, 1))
-    return moments.mean, jnp.where(std > 1e-6, std, 1.0)
+    std = jnp.where(std > 1e-6, std, 1.0)
+    size = moments.inputs
+    changes = std[size:] if settings.whiten_targets else jnp.ones_like(std[size:])
+    return Scaling(moments.mean[:size], std[:size], jnp.append(changes, 1.0))
 
 
 def forward(model: Model, obs: jax.Array, action: jax.Array, *, net: networks.GaussianMLP) -> networks.Prediction:
     """What the model says of (Δs, r) (equations 20 and 34). Shapes: obs [..., O], action [..., A]."""
-    inputs = (jnp.concatenate([obs, action], axis=-1) - model.input_mean) / model.input_std
+    scaling = model.scaling
+    inputs = (jnp.concatenate([obs, action], axis=-1) - scaling.input_mean) / scaling.input_std
     prior: Any = 0.0
     if model.prior is not None:
         prior = model.prior.scale * net.apply(model.prior.params, inputs, method=net.outputs)
-    prediction: Any = net.apply(model.params, inputs, prior)
+    prediction: Any = net.apply(model.params, inputs, scaling.output_std, prior)
     return prediction
 
 
@@ -156,7 +161,7 @@ def loss(model: Model, batch: Transition, *, net: networks.GaussianMLP) -> jax.A
 def validation_error(
     model: Model, rows_of: Callable[[jax.Array], Transition], split: Split, block: int, *, net: networks.GaussianMLP
 ) -> jax.Array:
-    """Mean squared error over the validation rows, [], in batches of a fixed size.
+    """Mean squared error over the validation rows, [], in units of the model's outputs, in batches of a fixed size.
 
     Args:
         rows_of: indices [B] -> the rows of D_E, leaves [B, ...].
@@ -166,7 +171,8 @@ def validation_error(
         rows, exists = split.validation_rows(index * VALIDATION_BATCH, VALIDATION_BATCH, block)
         batch = rows_of(rows)
         mean = forward(model, batch.obs, batch.action, net=net).mean
-        return total + jnp.sum(jnp.where(exists, jnp.mean((mean - _targets(batch)) ** 2, axis=-1), 0.0))
+        error = (mean - _targets(batch)) / model.scaling.output_std
+        return total + jnp.sum(jnp.where(exists, jnp.mean(error**2, axis=-1), 0.0))
 
     batches = -(-split.blocks // VALIDATION_BATCH)
     return jax.lax.fori_loop(0, batches, add_batch, 0.0) / jnp.maximum(split.blocks, 1)
@@ -176,7 +182,7 @@ def fit(
     model: Model,
     real: jax.Array,
     split: Split,
-    whitening: tuple[jax.Array, jax.Array],
+    whitening: Scaling,
     hyper: Hyper,
     key: jax.Array,
     *,
@@ -190,10 +196,10 @@ def fit(
     Args:
         real: D_E, [C, F].
         split: which of its rows train and which validate.
-        whitening: mean and standard deviation of the inputs, [O + A] each.
+        whitening: of its rows.
     """
     net, block = network(settings, spec), settings.validation_block
-    model = model.replace(input_mean=whitening[0], input_std=whitening[1])
+    model = model.replace(scaling=whitening)
 
     def rows_of(indices: jax.Array) -> Transition:
         return replay.unpack(real[indices], spec.obs_size, spec.action_size)

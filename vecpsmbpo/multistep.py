@@ -27,7 +27,7 @@ def loss(model: Model, batch: Transition, follows: jax.Array, *, net: networks.G
     def ahead(obs, h):
         prediction = dynamics.forward(model, obs, batch.action[:, h], net=net)
         change, reward = prediction.mean[:, :-1], prediction.mean[:, -1]
-        error = (change - (batch.next_obs[:, h] - batch.obs[:, h])) / model.input_std[:obs_size]
+        error = (change - (batch.next_obs[:, h] - batch.obs[:, h])) / model.scaling.input_std[:obs_size]
         squared = jnp.sum(error**2, axis=-1) + (reward - batch.reward[:, h]) ** 2
         return obs + change, jnp.sqrt(squared + 1e-12)  # the root of 0 has no slope
 

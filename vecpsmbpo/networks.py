@@ -48,13 +48,18 @@ class GaussianMLP(nn.Module):
             hidden = nn.swish(nn.Dense(self.hidden_size, kernel_init=model_init)(hidden))
         return nn.Dense(2 * self.output_size + self.predicts_termination, kernel_init=model_init)(hidden)
 
-    def __call__(self, inputs: jax.Array, prior: Any = 0.0) -> Prediction:
-        """The prediction of f_θ + prior. inputs [..., O + A], whitened."""
+    def __call__(self, inputs: jax.Array, scale: Any = 1.0, prior: Any = 0.0) -> Prediction:
+        """The prediction of f_θ + prior, whose outputs are in units of `scale` [O + 1].
+
+        inputs [..., O + A], whitened. In small units the variance may rise as far as in the plain ones.
+        """
         outputs = self.outputs(inputs) + prior
         mean, log_variance, rest = jnp.split(outputs, [self.output_size, 2 * self.output_size], axis=-1)
-        log_variance = MAX_LOG_VARIANCE - nn.softplus(MAX_LOG_VARIANCE - log_variance)
+        unit = 2 * jnp.log(scale)
+        most = MAX_LOG_VARIANCE + jnp.maximum(-unit, 0.0)
+        log_variance = most - nn.softplus(most - log_variance)
         log_variance = MIN_LOG_VARIANCE + nn.softplus(log_variance - MIN_LOG_VARIANCE)
-        return Prediction(mean, log_variance, rest[..., 0] if self.predicts_termination else None)
+        return Prediction(mean * scale, log_variance + unit, rest[..., 0] if self.predicts_termination else None)
 
 
 class ReluMLP(nn.Module):

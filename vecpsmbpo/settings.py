@@ -69,6 +69,7 @@ class Settings:
     model_improvement: float = _real(0, 1)
     model_max_epochs: int = _whole(1)
     validation_ratio: float = _real(0, 0.5, open_low=True)
+    whiten_targets: bool
     prior_scale: float = _real(0)
     # imagined data
     rollout_starts: int = _whole(1)

@@ -83,13 +83,26 @@ class Prior(struct.PyTreeNode):
     scale: jax.Array
 
 
+class Scaling(NamedTuple):
+    """Units of a model's inputs and outputs.
+
+    Attributes:
+        input_mean, input_std: [O + A], of the data that the model was last fitted on (equation 20).
+        output_std: [O + 1], of the changes and the reward; 1 where they are predicted as they are (A.1).
+    """
+
+    input_mean: jax.Array
+    input_std: jax.Array
+    output_std: jax.Array
+
+
 class Model(struct.PyTreeNode):
     """One dynamics model.
 
     Attributes:
         params: of `networks.GaussianMLP`.
         optimizer: state of Adam; it lives on from refit to refit.
-        input_mean, input_std: [O + A], of the data that the model was last fitted on (equation 20).
+        scaling: see `Scaling`.
         loss: [], mean negative log-likelihood (equation 17) over the last epoch of the last fit.
         val_mse: [], validation mean squared error of the parameters kept.
         prior: or None, where β = 0.
@@ -97,8 +110,7 @@ class Model(struct.PyTreeNode):
 
     params: Params
     optimizer: Any
-    input_mean: jax.Array
-    input_std: jax.Array
+    scaling: Scaling
     loss: jax.Array
     val_mse: jax.Array
     prior: Prior | None
@@ -208,10 +220,15 @@ class EpisodeEnd(struct.PyTreeNode):
 
 
 class Moments(struct.PyTreeNode):
-    """Running mean and sum of squared deviations of (observation, action) over D_E, [O + A] each (Welford)."""
+    """Running mean and sum of squared deviations of (observation, action, Δs) over D_E, [2 O + A] each (Welford).
+
+    Attributes:
+        inputs: O + A.
+    """
 
     mean: jax.Array
     deviation: jax.Array
+    inputs: int = struct.field(pytree_node=False)
 
 
 class SeedState(struct.PyTreeNode):

@@ -80,7 +80,7 @@ class Algorithm(ABC):
             agents=jax.vmap(self.init_agent)(layout.keys(agent_key, layout.member_ids())),
             real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
-            moments=Moments(mean=jnp.zeros(size), deviation=jnp.zeros(size)),
+            moments=Moments(*jnp.zeros((2, size + spec.obs_size)), inputs=size),
             posterior=members,
             episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
             memory=self.memory(),
@@ -182,7 +182,7 @@ class Algorithm(ABC):
         split_key, fit_key = jax.random.split(key)
         rows = counters.env_steps
         split = dynamics.Split.draw(split_key, rows, settings.replay_capacity, settings.validation_block)
-        whitening = dynamics.scaling(state.moments, rows)
+        whitening = dynamics.scaling(state.moments, rows, settings)
 
         def fit(model, key):
             return dynamics.fit(model, state.real, split, whitening, state.hyper, key, settings=settings, spec=spec)
@@ -197,7 +197,7 @@ class Algorithm(ABC):
 
 def _welford(moments: Moments, transition: Transition, rows: jax.Array) -> Moments:
     """Moments of one more row after `rows` of them."""
-    value = jnp.concatenate([transition.obs, transition.action])
+    value = jnp.concatenate([transition.obs, transition.action, transition.next_obs - transition.obs])
     change = value - moments.mean
     mean = moments.mean + change / (rows + 1)
-    return Moments(mean=mean, deviation=moments.deviation + change * (value - mean))
+    return moments.replace(mean=mean, deviation=moments.deviation + change * (value - mean))

@@ -33,7 +33,7 @@ class Slbo(Algorithm):
     def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""
         layout, rows = self.layout, counters.env_steps
-        whitening = dynamics.scaling(state.moments, rows)
+        whitening = dynamics.scaling(state.moments, rows, self.settings)
 
         def round_(learned, key):
             model, agent = learned
@@ -52,7 +52,7 @@ class Slbo(Algorithm):
             return (model, agent), None
 
         def learn(model, agent, key):
-            model = model.replace(input_mean=whitening[0], input_std=whitening[1])
+            model = model.replace(scaling=whitening)
             return jax.lax.scan(round_, (model, agent), jax.random.split(key, self.settings.rounds))[0]
 
         def learned(models, agents):
