@@ -1,0 +1,66 @@
+"""Draws the states that runs of one task have visited in a common plane (figures 8, 18 and 19).
+
+    python tools/states.py runs/x runs/y > states.csv
+
+One line per state: run, seed, env_steps (when it was visited), x, y: its UMAP embedding. The states are D_E of each run's
+newest checkpoint, thinned to `ROWS` per run and seed. Needs umap-learn: pip install 'vecpsmbpo[umap]'.
+"""
+
+import csv
+import importlib.util
+import sys
+
+import numpy as np
+
+from vecpsmbpo import config, runtime
+from vecpsmbpo.evaluate import restore
+from vecpsmbpo.settings import SettingError
+
+ROWS = 2000
+
+
+def visited(run_dir: str) -> list[tuple[str, int, int, np.ndarray]]:
+    """(run, seed, env_steps, observation [O]) of every state kept, oldest first."""
+    settings = config.load(run_dir)
+    runtime.configure(settings)
+    driver, saved = restore(settings)
+    rings = np.asarray(saved.state.seeds.real)
+    oldest = max(0, saved.step - rings.shape[1])
+    steps = np.unique(np.linspace(oldest, saved.step - 1, ROWS).astype(int))
+    size = driver.algorithm.spec.obs_size
+    return [
+        (run_dir, lane["seed"], int(step), ring[step % len(ring), :size])
+        for lane, ring in zip(settings.lanes, rings, strict=True)
+        for step in steps
+    ]
+
+
+def main(run_dirs: list[str]) -> int:
+    if not run_dirs:
+        print("usage: states.py RUN_DIR ...", file=sys.stderr)
+        return 2
+    if importlib.util.find_spec("umap") is None:
+        print("states.py: needs umap-learn; pip install 'vecpsmbpo[umap]'", file=sys.stderr)
+        return 2
+    try:
+        states = [state for run_dir in run_dirs for state in visited(run_dir)]
+        tasks = {config.load(run_dir).task for run_dir in run_dirs}
+        if len(tasks) > 1:
+            raise SettingError(f"states.py: all runs must be of one task, not of {', '.join(sorted(tasks))}")
+    except SettingError as error:
+        print(error, file=sys.stderr)
+        return 2
+    import umap
+
+    obs = np.stack([obs for *_, obs in states])
+    spread = obs.std(axis=0)
+    plane = umap.UMAP(random_state=0).fit_transform((obs - obs.mean(axis=0)) / np.where(spread > 0, spread, 1.0))
+    writer = csv.writer(sys.stdout)
+    writer.writerow(["run", "seed", "env_steps", "x", "y"])
+    for (run, seed, step, _), (x, y) in zip(states, plane, strict=True):
+        writer.writerow([run, seed, step, f"{x:.4f}", f"{y:.4f}"])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
