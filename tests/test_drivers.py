@@ -46,7 +46,8 @@ def make_driver(kind, terminates, settings):
     learner = algorithm(settings, probes.spec(terminates))
     if kind == "scan":
         return ScanDriver(learner, probes.Probe(terminates))
-    return HostDriver(learner, partial(probes.host, terminates))
+    make_env = partial(probes.host, terminates)
+    return HostDriver(learner, make_env(num_envs=len(settings.lanes), seed=settings.seed), make_env)
 
 
 CASES = [

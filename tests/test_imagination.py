@@ -8,7 +8,7 @@ import scipy.stats
 
 from tests.helpers import algorithm, initial, tiny
 from vecpsmbpo import replay
-from vecpsmbpo.drivers import over_seeds
+from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.types import Counters, EnvSpec, Transition
 
 LIMIT = 3.5

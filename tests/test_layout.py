@@ -9,7 +9,7 @@ import pytest
 
 from tests.helpers import algorithm, initial, tiny
 from vecpsmbpo import sac
-from vecpsmbpo.drivers import over_seeds
+from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs import specs
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.train import initial_inputs

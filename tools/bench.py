@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vecpsmbpo import config, envs, runtime
-from vecpsmbpo.drivers import ScanDriver, over_seeds
+from vecpsmbpo.drivers import ScanDriver
+from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs.registry import TASKS
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.train import initial_inputs, make_driver

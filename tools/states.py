@@ -2,7 +2,7 @@
 
     python tools/states.py runs/x runs/y > states.csv
 
-One line per state: run, seed, env_steps (when it was visited), x, y: its UMAP embedding. The states are D_E of each run's
+One line per state: run, seed, env_steps (when it was visited), x, y (UMAP). The states are D_E of each run's
 newest checkpoint, thinned to `ROWS` per run and seed. Needs umap-learn: pip install 'vecpsmbpo[umap]'.
 """
 

@@ -41,11 +41,11 @@ def make_driver(settings: Settings) -> Driver:
         SettingError: there is no such task (`envs.make`).
     """
     make_env = partial(envs.make, settings.env, settings.backend, **dict(settings.env_options))
-    env = make_env(seed=settings.seed)
+    env = make_env(num_envs=len(settings.lanes), seed=settings.seed)
     if not settings.episode_length:
         settings = dataclasses.replace(settings, episode_length=env.spec.episode_length)
     algorithm = algorithms.make(settings, env.spec)
-    return ScanDriver(algorithm, env) if settings.backend == "mjx" else HostDriver(algorithm, make_env)
+    return ScanDriver(algorithm, env) if settings.backend == "mjx" else HostDriver(algorithm, env, make_env)
 
 
 def initial_inputs(settings: Settings) -> tuple[jax.Array, Hyper]:

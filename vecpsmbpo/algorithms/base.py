@@ -188,7 +188,7 @@ class Algorithm(ABC):
             return dynamics.fit(model, state.real, split, whitening, state.hyper, key, settings=settings, spec=spec)
 
         keys = self.layout.keys(fit_key, self.layout.model_ids())
-        # Only the models go through the branch: see `drivers.observe_and_learn`.
+        # Only the models go through the branch: see `drivers.common.observe_and_learn`.
         fitted = jax.lax.cond(
             enabled, lambda models: self.layout.map_local(fit, models, keys), lambda x: x, state.models
         )

@@ -1,0 +1,141 @@
+"""Simulators on the host: the functions of the algorithm, jitted one by one, with a simulator stepped between them."""
+
+import itertools
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.drivers.common import (
+    BY_SEED,
+    SHARED,
+    Returns,
+    begin_stride,
+    greedily,
+    many,
+    observe_and_learn,
+    over_seeds,
+    split_for_episodes,
+    split_keys,
+)
+from vecpsmbpo.envs.host.batched import HostEnv
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
+
+
+class HostDriver:
+    """The same functions, jitted one by one, with a simulator stepped between them."""
+
+    def __init__(self, algorithm: Algorithm, env: HostEnv, make_env: Callable[..., HostEnv]):
+        """
+        Args:
+            env: one simulator per seed.
+            make_env: (num_envs, seed) -> others of the same task, to evaluate in.
+        """
+        self.algorithm = algorithm
+        self.settings: Settings = algorithm.settings
+        self.layout = algorithm.layout
+        self.compile_seconds = 0.0
+        self._make_env = make_env
+        self._env = env
+        self._env.episode_length = self.settings.episode_length
+        specs, seeds = self.layout.specs(), self.layout.specs().seeds
+        spread = self.layout.spread
+        self._init = spread(self._init_local, (BY_SEED, BY_SEED, BY_SEED), specs)
+        self._begin = spread(lambda state: begin_stride(algorithm, state), (specs,), (specs, SHARED), donate_argnums=0)
+        self._act = spread(self._act_local, (specs.counters, seeds, BY_SEED), (BY_SEED, BY_SEED, BY_SEED))
+        self._observe = spread(
+            self._observe_local,
+            (specs, BY_SEED, BY_SEED, BY_SEED, BY_SEED, BY_SEED, SHARED),
+            (specs, BY_SEED),
+            donate_argnums=0,
+        )
+        self._policy = spread(jax.vmap(algorithm.evaluation_policy), (seeds, BY_SEED), BY_SEED)
+        self._act_greedily = spread(
+            jax.vmap(partial(greedily, algorithm), in_axes=(0, None, 0, 0, 0)),
+            (BY_SEED, SHARED, BY_SEED, BY_SEED, BY_SEED),
+            (BY_SEED, BY_SEED),
+        )
+
+    def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        return self._init(keys, hyper, jnp.asarray(self._env.reset()))
+
+    def compile(self, state: TrainState) -> None:
+        pass  # each function is compiled when it is first needed
+
+    def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
+        news = []
+        for _ in range(strides):
+            state, learning = self._begin(state)
+            for _ in range(self.settings.stride):
+                state, end = self._step(state, learning)
+                news.append(end)
+        return state, jax.tree.map(lambda *xs: np.stack(xs), *news)
+
+    def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
+        obs = state.env
+        action, memory, keys = self._act(state.counters, state.seeds, obs)
+        step = self._env.step(np.asarray(action))
+        terminated = step.terminated.astype(np.float32)
+        transition = Transition(*map(jnp.asarray, (obs, action, step.reward, step.next_obs, terminated)))
+        state, end = self._observe(state, memory, transition, step.truncated, keys, step.obs, learning)
+        return state, jax.tree.map(np.asarray, end)
+
+    def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
+        seeds, obs_size = self.layout.num_seeds, self.algorithm.spec.obs_size
+        split = split_for_episodes(keys, episodes)
+        policy = self._policy(state.seeds, split[:, 0])
+        env_seed = int(jax.random.randint(split[0, 1], (), 0, 2**30))
+        env = self._make_env(num_envs=seeds * episodes, seed=env_seed)
+        env.episode_length = self.settings.episode_length
+        obs = env.reset()
+        count = seeds * episodes
+        memory = many(self.algorithm.memory(), seeds, episodes)
+        total, length, alive = np.zeros(count), np.zeros(count, int), np.ones(count, bool)
+        for t in itertools.count():
+            if not alive.any():
+                break
+            states = obs.reshape(seeds, episodes, obs_size)
+            action, memory = self._act_greedily(policy, jnp.int32(t), memory, states, split[:, 1:])
+            step = env.step(np.asarray(action).reshape(count, -1))
+            obs = step.obs
+            total += np.where(alive, step.reward, 0.0)
+            length += alive
+            alive &= ~(step.terminated | step.truncated)
+        return Returns(total.reshape(seeds, episodes), length.reshape(seeds, episodes))
+
+    def save_env(self) -> dict[str, Any]:
+        return self._env.save()
+
+    def load_env(self, saved: dict[str, Any]) -> None:
+        self._env.load(saved)
+
+    def _init_local(self, keys: jax.Array, hyper: Hyper, obs: jax.Array) -> TrainState:
+        counters = Counters(env_steps=jnp.int32(0), imagined_rows=jnp.int32(0))
+        return TrainState(counters, jax.vmap(self.algorithm.init)(keys, hyper), obs)
+
+    def _act_local(self, counters: Counters, seeds: SeedState, obs: jax.Array) -> tuple[jax.Array, Any, jax.Array]:
+        # The key is not advanced here but in `_observe_local`, which splits the same one: acting needs no copy of
+        # the state, and changes nothing.
+        _, keys = split_keys(seeds, 3)
+        return *over_seeds(self.algorithm.act)(counters, seeds, obs, keys[:, 0]), keys[:, 1:]
+
+    def _observe_local(
+        self,
+        state: TrainState,
+        memory: Any,
+        transition: Transition,
+        truncated: jax.Array,
+        keys: jax.Array,
+        obs: jax.Array,
+        learning: jax.Array,
+    ) -> tuple[TrainState, EpisodeEnd]:
+        seeds, _ = split_keys(state.seeds.replace(memory=memory), 3)
+        counters, seeds, end = observe_and_learn(
+            self.algorithm, state.counters, seeds, transition, truncated, keys, learning
+        )
+        return TrainState(counters, seeds, obs), end

@@ -1,0 +1,146 @@
+"""MJX environments: real steps, refits, rollouts and updates as one compiled program over the mesh."""
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec
+
+from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.drivers.common import (
+    BY_SEED,
+    SHARED,
+    Returns,
+    begin_stride,
+    greedily,
+    many,
+    observe_and_learn,
+    over_seeds,
+    split_for_episodes,
+    split_keys,
+)
+from vecpsmbpo.layout import SEEDS
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
+
+COMPILER_STACK = 64 * 2**20  # bytes
+
+_LOG = PartitionSpec(None, None, SEEDS)
+
+
+class ScanDriver:
+    """Real steps, refits, rollouts and updates as one compiled program over the mesh."""
+
+    def __init__(self, algorithm: Algorithm, env: Any):
+        self.algorithm, self.env = algorithm, env
+        self.settings: Settings = algorithm.settings
+        self.layout = algorithm.layout
+        self.compile_seconds = 0.0
+        specs = self.layout.specs()
+        self._init = self.layout.spread(self._init_local, (BY_SEED, BY_SEED), specs)
+        self._run = self.layout.spread(self._run_local, (specs, SHARED), (specs, _LOG), donate_argnums=0)
+        self._evaluate = self.layout.spread(self._evaluate_local, (specs.seeds, BY_SEED), (BY_SEED, BY_SEED))
+        self._compiled: Any = None
+        self._compiled_evaluate: Any = None
+
+    def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        return self._init(keys, hyper)
+
+    def compile(self, state: TrainState) -> None:
+        began = time.perf_counter()
+        keys = jax.eval_shape(lambda key: split_for_episodes(key, self.settings.eval_episodes), state.seeds.key)
+        lowered = (self._run.lower(state, jnp.int32(1)), self._evaluate.lower(state.seeds, keys))
+        # XLA compiles outside of Python's lock: together they cost the longer one. It recurses deeper than a thread's
+        # usual stack allows (jax 0.11.2 crashes).
+        usual = threading.stack_size(COMPILER_STACK)
+        with ThreadPoolExecutor() as pool:
+            self._compiled, self._compiled_evaluate = pool.map(lambda program: program.compile(), lowered)
+        threading.stack_size(usual)
+        self.compile_seconds = time.perf_counter() - began
+
+    def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
+        state, log = (self._compiled or self._run)(state, jnp.int32(strides))
+        flat = jax.tree.map(lambda x: np.asarray(x)[:strides].reshape(-1, *x.shape[2:]), log)
+        return state, flat
+
+    def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
+        program = self._compiled_evaluate if episodes == self.settings.eval_episodes else None
+        return Returns(*map(np.asarray, (program or self._evaluate)(state.seeds, split_for_episodes(keys, episodes))))
+
+    def save_env(self) -> dict[str, Any]:
+        return {}  # the environments are part of the train state
+
+    def load_env(self, saved: dict[str, Any]) -> None:
+        pass
+
+    def _init_local(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        split = jax.vmap(jax.random.split)(keys)
+        counters = Counters(env_steps=jnp.int32(0), imagined_rows=jnp.int32(0))
+        return TrainState(
+            counters=counters,
+            seeds=jax.vmap(self.algorithm.init)(split[:, 0], hyper),
+            env=jax.vmap(self.env.reset)(split[:, 1]),
+        )
+
+    def _run_local(self, state: TrainState, strides: jax.Array) -> tuple[TrainState, EpisodeEnd]:
+        settings = self.settings
+
+        def stride(index, carry):
+            state, log = carry
+            state, learning = begin_stride(self.algorithm, state)
+            step = lambda state, _: self._step(state, learning)  # noqa: E731
+            state, news = jax.lax.scan(step, state, None, length=settings.stride)
+            return state, jax.tree.map(lambda all_, new: all_.at[index].set(new), log, news)
+
+        shape = (settings.epoch_steps // settings.stride, settings.stride, state.env.obs.shape[0])
+        log = EpisodeEnd.blank(shape, settings.n_members)
+        return jax.lax.fori_loop(0, strides, stride, (state, log))
+
+    def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
+        """One real step of every seed's environment, and what follows it."""
+        seeds, keys = split_keys(state.seeds, 4)
+        obs = state.env.obs
+        action, memory = over_seeds(self.algorithm.act)(state.counters, seeds, obs, keys[:, 0])
+        seeds = seeds.replace(memory=memory)
+        env = jax.vmap(self.env.step)(state.env, action)
+        transition = Transition(obs, action, env.reward, env.obs, env.done)
+        truncated = (seeds.episode.length + 1 >= self.settings.episode_length) & (env.done == 0)
+        counters, seeds, end = observe_and_learn(
+            self.algorithm, state.counters, seeds, transition, truncated, keys[:, 1:3], learning
+        )
+
+        def begin_episodes(env):
+            fresh = jax.vmap(self.env.reset)(keys[:, 3])
+            return jax.tree.map(lambda new, old: jax.vmap(jnp.where)(end.done, new, old), fresh, env)
+
+        # Not at every step: the resets of other libraries' environments cost as much as a step of physics.
+        env = jax.lax.cond(jnp.any(end.done), begin_episodes, lambda env: env, env)
+        return TrainState(counters, seeds, env), end
+
+    def _evaluate_local(self, seeds: SeedState, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def one_seed(seed, keys):
+            policy = self.algorithm.evaluation_policy(seed, keys[0])
+
+            def step(carry):
+                t, memory, env, total, length, alive = carry
+                action, memory = greedily(self.algorithm, policy, t, memory, env.obs, keys[1:])
+                env = jax.vmap(self.env.step)(env, action)
+                total = total + jnp.where(alive, env.reward, 0.0)
+                return t + 1, memory, env, total, length + alive, alive & (env.done == 0)
+
+            def running(carry):
+                t, *_, alive = carry
+                return (t < self.settings.episode_length) & jnp.any(alive)
+
+            count = keys.shape[0] - 1
+            start = jax.vmap(self.env.reset)(keys[1:])
+            memory = many(self.algorithm.memory(), count)
+            carry = (0, memory, start, jnp.zeros(count), jnp.zeros(count, jnp.int32), jnp.ones(count, bool))
+            *_, total, length, _ = jax.lax.while_loop(running, step, carry)
+            return total, length
+
+        return jax.vmap(one_seed)(seeds, keys)
