@@ -80,7 +80,7 @@ class Algorithm(ABC):
             agents=jax.vmap(self.init_agent)(layout.keys(agent_key, layout.member_ids())),
             real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
-            moments=Moments(*jnp.zeros((2, size + spec.obs_size)), inputs=size),
+            moments=Moments(jnp.zeros(size + spec.obs_size), jnp.zeros(size + spec.obs_size), inputs=size),
             posterior=members,
             episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
             memory=self.memory(),
