@@ -18,7 +18,7 @@ from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, allowed, check
 MISTAKES = [
     (["train", "env=hoper"], "env=hoper: did you mean hopper"),
     (["train", "size=big"], "size=big: one of cpu, paper, tiny"),
-    (["train", "algo=ops"], "algo=ops: did you mean ops_mbpo"),
+    (["train", "algo=ops_mpo"], "algo=ops_mpo: did you mean ops_mbpo"),
     (["train", "env=gymnasium"], "env.id: must be given with env=gymnasium"),
     (["train", "env=hopper", "env.id=3"], "env.id: no such option of env=hopper; it has none"),
     (["train", "env=dm_control", "env.tsk=spin"], "env.tsk: no such option of env=dm_control; it has env.domain"),
