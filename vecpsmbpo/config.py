@@ -103,13 +103,9 @@ def _sweep_values(override: Override) -> list[Any]:
 
 
 def _check_override(name: str, value: Any) -> Any:
-    if name in GROUPS:
+    if name in (*GROUPS, "experiment"):
         if value not in options(name):
             raise SettingError(f"{name}={value}: {closest(str(value), options(name))}")
-        return value
-    if name == "experiment":
-        if value not in options(name):
-            raise SettingError(f"experiment={value}: {closest(str(value), options(name))}")
         return value
     if name.startswith("env."):
         return value

@@ -65,8 +65,8 @@ def load_policy(run_dir: str | Path) -> tuple[Settings, Callable[[jax.Array], ja
         SettingError: there is no run in `run_dir`, or it holds no checkpoint.
     """
     settings = config.load(run_dir)
-    if settings.plans:
-        raise SettingError(f"run_dir={run_dir}: algo={settings.algo} plans every action and has no policy")
+    if settings.plans or settings.alternates:
+        raise SettingError(f"run_dir={run_dir}: algo={settings.algo} has no policy of SAC's, which alone can be loaded")
     driver, saved = restore(settings)
     seeds = driver.layout.unpad(saved.state).seeds
     member = jnp.argmax(seeds.posterior.returns[0])
