@@ -41,14 +41,15 @@ def _moments(rows):
 
 @pytest.fixture(scope="module")
 def fit(linear):
-    """The fit as one compiled function of (model, number of rows, key)."""
-    settings, rows = linear
+    """The fit as one compiled function of (model, number of rows, key), and of other rows."""
+    return _compiled_fit(*linear)
 
+
+def _compiled_fit(settings, usual):
     @jax.jit
-    def run(model, count, key):
+    def run(model, count, key, rows=usual, hyper=Hyper.of(settings)):
         split = dynamics.Split.draw(key, count, CAPACITY, settings.validation_block)
         whitening = dynamics.scaling(_moments(rows), jnp.int32(CAPACITY), settings)
-        hyper = Hyper.of(settings)
         return dynamics.fit(model, rows, split, whitening, hyper, key, settings=settings, spec=SPEC)
 
     return run
@@ -75,19 +76,50 @@ def test_a_data_set_that_grows_needs_no_new_program(linear, fit, key):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model))
 
 
-def test_the_best_parameters_are_restored(linear, fit, key):
-    """Under a learning rate that destroys the model, the fit must hand back what it started from."""
+def test_the_best_epoch_is_kept(linear, key):
+    """At a learning rate that throws the error up and down, more epochs never give a worse model back, and the error
+    that a fit reports is that of the parameters it hands back."""
     settings, rows = linear
-    model = fit(dynamics.init(key, Hyper.of(settings), settings, SPEC), jnp.int32(CAPACITY), key)
+    hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(0.1))
+    model = dynamics.init(key, hyper, settings, SPEC)
     split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
-    hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(1.0))
-    whitening = model.scaling
-    refit = jax.jit(partial(dynamics.fit, settings=settings, spec=SPEC))
-    after = refit(model, rows, split, whitening, hyper, key)
+    validation, exists = split.validation_rows(jnp.int32(0), CAPACITY, settings.validation_block)
+    held_out = rows[validation[exists]]
+    target = jnp.concatenate([held_out[:, 3:5] - held_out[:, :2], held_out[:, 5:6]], axis=1)
+    errors = []
+    for epochs in (1, 4, 16):
+        chosen = dataclasses.replace(settings, model_max_epochs=epochs)
+        fitted = _compiled_fit(chosen, rows)(model, jnp.int32(CAPACITY), key, hyper=hyper)
+        net = dynamics.network(settings, SPEC)
+        mean = dynamics.forward(fitted, held_out[:, :2], held_out[:, 2:3], net=net).mean
+        assert fitted.val_mse == pytest.approx(float(jnp.mean((mean - target) ** 2)), rel=1e-4)
+        errors.append(float(fitted.val_mse))
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_a_fit_stops_after_its_patience(linear, fit, key):
+    """With a learning rate of 0 the first epoch's error is never improved on."""
+    settings, _ = linear
+    hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(0.0))
+    model = dynamics.init(key, hyper, settings, SPEC)
+    after = fit(model, jnp.int32(CAPACITY), key, hyper=hyper)
     jax.tree.map(np.testing.assert_array_equal, after.params, model.params)
     steps = jax.tree.leaves(after.optimizer)[0] - jax.tree.leaves(model.optimizer)[0]
     per_epoch = -(-CAPACITY // 5 * 4 // settings.model_batch_size)
-    assert steps == pytest.approx(settings.model_patience * per_epoch, abs=settings.model_patience)
+    assert steps == pytest.approx((1 + settings.model_patience) * per_epoch, abs=1 + settings.model_patience)
+
+
+def test_what_cannot_be_predicted_does_not_keep_the_rest_from_being_learned(linear, fit, key):
+    """Impacts at random moments make up nearly all of the error; the other coordinate's rule, which is new, is less than
+    the threshold of 1% of it, and is learned all the same."""
+    settings, rows = linear
+    model = fit(dynamics.init(key, Hyper.of(settings), settings, SPEC), jnp.int32(CAPACITY), key)
+    impact = 10.0 * jax.random.bernoulli(key, 0.1, (CAPACITY,))
+    new_rule = rows.at[:, 3].add(impact).at[:, 4].set(rows[:, 1] + 0.2 * rows[:, 0])
+    after = fit(model, jnp.int32(CAPACITY), key, new_rule)
+    mean = dynamics.forward(after, rows[:, :2], rows[:, 2:3], net=dynamics.network(settings, SPEC)).mean
+    assert after.val_mse > 100 * np.mean((0.4 * rows[:, 0]) ** 2) / 3 / 2  # of what the old rule is wrong by
+    assert np.mean((mean[:, 1] - 0.2 * rows[:, 0]) ** 2) < 0.01 * np.mean((0.4 * rows[:, 0]) ** 2)
 
 
 def test_split_is_a_partition_with_one_row_in_five_validating(key):

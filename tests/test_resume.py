@@ -17,6 +17,7 @@ import pytest
 
 from tests.helpers import argv, check_log, command, environment, tiny
 from vecpsmbpo import checkpoint, config, evaluate, metrics, train
+from vecpsmbpo.settings import SettingError
 
 SMALL = ["env=cartpole_swingup", "size=tiny", "num_seeds=2", "total_steps=200"]
 
@@ -112,6 +113,13 @@ def test_a_host_run_resumes_exactly(algo, tmp_path):
             result = command(*arguments, cwd=tmp_path, one_thread=True)
             assert result.returncode == 0, result.stderr
     assert_same_run(tmp_path / "twice", tmp_path / "once")
+    if algo == "pets":
+        with pytest.raises(SettingError, match="algo=pets plans its actions"):
+            evaluate.load_policy(tmp_path / "once")
+    else:
+        actions = evaluate.load_policy(tmp_path / "once")[1](np.ones((4, 11)))
+        assert actions.shape == (4, 3)
+        assert np.all(np.abs(actions) <= 1)
 
 
 def test_a_finished_run_says_so(undisturbed):
@@ -149,6 +157,22 @@ def short_run(tmp_path_factory):
     settings = tiny(env="ball_in_cup", backend="host", run_dir=folder / "run")
     assert train.train(settings) == 0
     return settings
+
+
+def test_a_policy_is_loaded_from_a_run(short_run):
+    """The member that has earned the most; its mean action against a forward pass written out in numpy."""
+    settings, act = evaluate.load_policy(short_run.run_dir)
+    assert settings == config.load(short_run.run_dir)
+    seeds = evaluate.restore(settings)[1].state.seeds
+    member = int(np.argmax(seeds.posterior.returns[0]))
+    layers = jax.tree.map(lambda x: np.asarray(x[0, member], float), seeds.agents.actor)["params"]["ReluMLP_0"]
+    obs = np.random.default_rng(0).normal(size=(3, 8))
+    hidden = obs
+    for index in range(settings.policy_hidden_layers):
+        hidden = np.maximum(hidden @ layers[f"Dense_{index}"]["kernel"] + layers[f"Dense_{index}"]["bias"], 0)
+    output = layers[f"Dense_{settings.policy_hidden_layers}"]
+    loc = (hidden @ output["kernel"] + output["bias"])[:, :2]
+    np.testing.assert_allclose(act(obs), np.tanh(loc), atol=1e-5)
 
 
 def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(short_run, tmp_path, capsys):

@@ -7,11 +7,14 @@ For each task:
                 agreement of `terminated`; states from random policies (fresh every step, and held for ten) and, where a
                 run directory of the task is given, from its trained policy
     reset       the smallest p-value of two-sample Kolmogorov–Smirnov tests over the coordinates of initial states
-    episodes    length and return of whole random-policy episodes on both backends, mean and standard error
+    episodes    return and length of each policy's whole episodes on both backends, mean and standard error, and the
+                p-value of a two-sample Kolmogorov–Smirnov test of the returns
 """
 
 import csv
+import itertools
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,11 +26,12 @@ import scipy.stats
 from rich.console import Console
 from rich.table import Table
 
-from vecpsmbpo import envs
+from vecpsmbpo import envs, evaluate
 from vecpsmbpo.envs.mjx.simulator import Physics
 from vecpsmbpo.envs.registry import TASKS
 
 PORTED = [name for name, task in TASKS.items() if task.sizes and "mjx" in task.code]
+Policy = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]  # obs [..., O], t, key -> action [..., A]
 NEAR = 1e-4  # a state this close to a termination threshold may fall on either side in float32
 
 
@@ -52,29 +56,26 @@ def simulator_data(host: Any) -> Any:
     return env.physics.data if hasattr(env, "physics") else env.unwrapped.data
 
 
-def uniform(held: int, action_size: int, seed: int):
-    """A policy of uniform actions, each held for `held` steps."""
-    random, state = np.random.default_rng(seed), {"t": 0, "action": np.zeros(action_size)}
+def uniform(held: int, action_size: int) -> Policy:
+    """Uniform actions, each held for `held` steps."""
 
-    def act(obs: np.ndarray) -> np.ndarray:
-        if state["t"] % held == 0:
-            state["action"] = random.uniform(-1, 1, action_size)
-        state["t"] += 1
-        return state["action"]
+    def act(obs: jax.Array, t: jax.Array, key: jax.Array) -> jax.Array:
+        shape = (*obs.shape[:-1], action_size)
+        return jax.random.uniform(jax.random.fold_in(key, t // held), shape, minval=-1.0, maxval=1.0)
 
     return act
 
 
-def collect(name: str, act: Any, states: int, seed: int) -> Step:
-    """Steps the original with the policy `act`: obs [O] -> action [A]."""
-    host = envs.make(name, "host", seed=seed)
+def collect(name: str, policy: Policy, states: int, seed: int) -> Step:
+    """Steps the original with `policy`."""
+    host, act = envs.make(name, "host", seed=seed), jax.jit(policy)
     obs, rows = host.reset()[0], []
-    for _ in range(states):
+    for t in range(states):
         data = simulator_data(host)
         seen = np.array(data.qpos)
         if data.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
             seen[:3] = data.xpos[data.model.jnt_bodyid[0]]
-        action = act(obs)
+        action = np.asarray(act(obs, t, jax.random.key(seed)))
         before = [np.array(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)]
         step = host.step(action[None])
         contacts = simulator_data(host).ncon
@@ -147,14 +148,14 @@ def compare_resets(port: Port, name: str, count: int) -> float:
     return float(smallest)
 
 
-def random_episodes(port: Port, name: str, count: int) -> dict[str, float]:
-    """Whole episodes of uniform actions on both backends: means and standard errors of return and length."""
-    env, limit = port.env, port.env.spec.episode_length
+def compare_episodes(port: Port, name: str, policy: Policy, count: int) -> dict[str, float]:
+    """`count` whole episodes of `policy` on each backend: mean and standard error of return and length, and the p-value
+    of a two-sample Kolmogorov–Smirnov test of the returns."""
+    env, limit, act = port.env, port.env.spec.episode_length, jax.jit(policy)
 
-    def step(carry, key):
+    def step(carry, t):
         state, alive, total, length = carry
-        action = jax.random.uniform(key, (count, env.action_size), minval=-1.0, maxval=1.0)
-        state = jax.vmap(env.step)(state, action)
+        state = jax.vmap(env.step)(state, policy(state.obs, t, jax.random.key(3)))
         total, length = total + jnp.where(alive, state.reward, 0.0), length + alive
         return (state, alive & (state.done == 0), total, length), None
 
@@ -162,18 +163,20 @@ def random_episodes(port: Port, name: str, count: int) -> dict[str, float]:
     def episodes(key):
         state = jax.vmap(env.reset)(jax.random.split(key, count))
         start = (state, jnp.ones(count, bool), jnp.zeros(count), jnp.zeros(count, jnp.int32))
-        _, _, total, length = jax.lax.scan(step, start, jax.random.split(key, limit))[0]
+        _, _, total, length = jax.lax.scan(step, start, jnp.arange(limit))[0]
         return total, length
 
     ours = [np.asarray(x, float) for x in episodes(jax.random.key(2))]
-    host, random = envs.make(name, "host", num_envs=count, seed=5), np.random.default_rng(5)
-    host.reset()
+    host = envs.make(name, "host", num_envs=count, seed=5)
+    obs = host.reset()
     total, length, alive = np.zeros(count), np.zeros(count), np.ones(count, bool)
-    while alive.any():
-        news = host.step(random.uniform(-1, 1, (count, env.action_size)))
-        total, length = total + np.where(alive, news.reward, 0.0), length + alive
+    for t in itertools.count():
+        if not alive.any():
+            break
+        news = host.step(np.asarray(act(obs, t, jax.random.key(4))))
+        obs, total, length = news.obs, total + np.where(alive, news.reward, 0.0), length + alive
         alive &= ~(news.terminated | news.truncated)
-    found = {}
+    found = {"return_p": float(scipy.stats.ks_2samp(ours[0], total).pvalue)}
     for backend, values in (("mjx", ours), ("host", (total, length))):
         for what, value in zip(("return", "length"), values, strict=True):
             found[f"{what}_{backend}"] = float(value.mean())
@@ -181,12 +184,10 @@ def random_episodes(port: Port, name: str, count: int) -> dict[str, float]:
     return found
 
 
-def trained_policy(run_dir: str):
-    """The task of a run, and its best member's policy: obs [O] -> action [A]."""
-    from vecpsmbpo import evaluate
-
+def trained_policy(run_dir: str) -> tuple[str, Policy]:
+    """The task of a run, and the policy that `load_policy` gives of it."""
     settings, policy = evaluate.load_policy(run_dir)
-    return settings.env, lambda obs: np.asarray(policy(obs))
+    return settings.env, lambda obs, t, key: policy(obs)
 
 
 def main(arguments: list[str]) -> None:
@@ -198,13 +199,14 @@ def main(arguments: list[str]) -> None:
     writer: Any = None
     for name in names:
         port = Port(name)
-        policies = {"random": uniform(1, port.env.action_size, 0), "held": uniform(10, port.env.action_size, 1)}
+        policies = {"random": uniform(1, port.env.action_size), "held": uniform(10, port.env.action_size)}
         if name in trained:
             policies["trained"] = trained[name]
-        whole = {"reset_p": compare_resets(port, name, 1000), **random_episodes(port, name, episodes)}
-        for policy, act in policies.items():
-            steps = collect(name, act, states, seed=len(rows))
-            rows.append({"task": name, "policy": policy, **compare_steps(port, steps), **whole})
+        reset_p = compare_resets(port, name, 1000)
+        for label, policy in policies.items():
+            steps = compare_steps(port, collect(name, policy, states, seed=len(rows)))
+            whole = compare_episodes(port, name, policy, episodes)
+            rows.append({"task": name, "policy": label, **steps, "reset_p": reset_p, **whole})
             if writer is None:
                 writer = csv.DictWriter(sys.stdout, rows[0], lineterminator="\n")
                 writer.writeheader()

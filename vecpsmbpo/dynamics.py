@@ -189,7 +189,11 @@ def fit(
     settings: Settings,
     spec: EnvSpec,
 ) -> Model:
-    """Trains until validation error has not improved for `model_patience` epochs; keeps the best parameters.
+    """Trains until validation error has not fallen by `model_improvement` for `model_patience` epochs; keeps the
+    parameters of least error.
+
+    What the fit begins with does not compete: it has seen most rows of the new validation set. Nor must an epoch pass
+    the threshold to be kept: where a task's impacts dominate the error, everything else that can be learned is less.
 
     Every trip count is traced: one compiled program serves a data set of any size.
 
@@ -217,7 +221,7 @@ def fit(
     steps_per_epoch = -(-split.blocks * (block - 1) // settings.model_batch_size)
 
     def epoch(carry):
-        params, optimizer, best_params, best, stale, count, _ = carry
+        params, optimizer, best_params, best, mark, stale, count, _ = carry
 
         def body(index, inner):
             params, optimizer, total = inner
@@ -227,15 +231,16 @@ def fit(
 
         params, optimizer, total = jax.lax.fori_loop(0, steps_per_epoch, body, (params, optimizer, 0.0))
         mse = validate(params)
-        better = mse < best * (1 - settings.model_improvement)
-        best_params = jax.tree.map(lambda new, old: jnp.where(better, new, old), params, best_params)
-        best, stale = jnp.where(better, mse, best), jnp.where(better, 0, stale + 1)
-        return params, optimizer, best_params, best, stale, count + 1, total / jnp.maximum(steps_per_epoch, 1)
+        best_params = jax.tree.map(partial(jnp.where, mse < best), params, best_params)
+        improved = mse < mark * (1 - settings.model_improvement)
+        mark, stale = jnp.where(improved, mse, mark), jnp.where(improved, 0, stale + 1)
+        train_loss = total / jnp.maximum(steps_per_epoch, 1)
+        return params, optimizer, best_params, jnp.minimum(mse, best), mark, stale, count + 1, train_loss
 
     def unfinished(carry):
         *_, stale, count, _ = carry
         return (stale < settings.model_patience) & (count < settings.model_max_epochs)
 
-    start = (model.params, model.optimizer, model.params, validate(model.params), 0, 0, model.loss)
-    _, optimizer, params, best, _, _, train_loss = jax.lax.while_loop(unfinished, epoch, start)
+    start = (model.params, model.optimizer, model.params, jnp.inf, jnp.inf, 0, 0, model.loss)
+    _, optimizer, params, best, _, _, _, train_loss = jax.lax.while_loop(unfinished, epoch, start)
     return model.replace(params=params, optimizer=optimizer, loss=train_loss, val_mse=best)

@@ -1,6 +1,7 @@
 """`vecpsmbpo eval`: whole episodes of a trained run's policies."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -8,8 +9,9 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from vecpsmbpo import checkpoint, config, runtime, sac
+from vecpsmbpo import checkpoint, config, runtime
 from vecpsmbpo.drivers import Driver
+from vecpsmbpo.drivers.common import evaluation_policies
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.train import evaluation_keys, initial_inputs, make_driver
 
@@ -62,14 +64,13 @@ def load_policy(run_dir: str | Path) -> tuple[Settings, Callable[[jax.Array], ja
         The run's settings, and its mean action as a jitted function: obs [..., O] -> action [..., A] in [-1, 1].
 
     Raises:
-        SettingError: there is no run in `run_dir`, or it holds no checkpoint.
+        SettingError: there is no run in `run_dir`, it holds no checkpoint, or its algorithm has no policy (PETS).
     """
     settings = config.load(run_dir)
-    if settings.plans or settings.alternates:
-        raise SettingError(f"run_dir={run_dir}: algo={settings.algo} has no policy of SAC's, which alone can be loaded")
-    driver, saved = restore(settings)
-    seeds = driver.layout.unpad(saved.state).seeds
-    member = jnp.argmax(seeds.posterior.returns[0])
-    params = jax.tree.map(lambda x: x[0, member], seeds.agents.actor)
-    actor = sac.make_networks(settings, driver.algorithm.spec).actor
-    return settings, jax.jit(lambda obs: actor.law(params, obs).mode())
+    if settings.plans:
+        raise SettingError(f"run_dir={run_dir}: algo={settings.algo} plans its actions; there is no policy to load")
+    driver, saved = restore(replace(settings, eval_policy="best"))
+    algorithm, seeds = driver.algorithm, saved.state.seeds
+    policy = jax.tree.map(lambda x: x[0], evaluation_policies(algorithm)(seeds, seeds.key))
+    step, key = jnp.int32(0), jax.random.key(0)  # a policy, unlike a plan, needs neither
+    return settings, jax.jit(lambda obs: algorithm.act_greedily(policy, step, algorithm.memory(), obs, key)[0])

@@ -1,9 +1,8 @@
 """What both drivers share: the order in which an algorithm's functions are called, and what a driver can do.
 
-A period is `model_update_every` steps: it
-begins with a refresh (models refitted, imagination renewed); then every step acts, observes and learns. A chunk is a
-number of strides, a few steps each, decided when the program is called: one compiled program serves chunks of any
-length, and how a run is cut into chunks does not change it.
+A period is `model_update_every` steps: it begins with a refresh (models refitted, imagination renewed); then every step
+acts, observes and learns. A chunk is a number of strides, a few steps each, decided when the program is called: one
+compiled program serves chunks of any length, and how a run is cut into chunks does not change it.
 """
 
 from collections.abc import Callable
@@ -113,6 +112,12 @@ def observe_and_learn(
         seeds,
     )
     return counters, seeds.replace(agents=agents), end
+
+
+def evaluation_policies(algorithm: Algorithm) -> Callable:
+    """Compiled (seeds, keys [S]) -> what `Algorithm.act_greedily` needs of every seed, leaves [S, ...]."""
+    seeds = algorithm.layout.specs().seeds
+    return algorithm.layout.spread(jax.vmap(algorithm.evaluation_policy), (seeds, BY_SEED), BY_SEED)
 
 
 def greedily(

@@ -15,6 +15,7 @@ from vecpsmbpo.drivers.common import (
     SHARED,
     Returns,
     begin_stride,
+    evaluation_policies,
     greedily,
     many,
     observe_and_learn,
@@ -54,7 +55,7 @@ class HostDriver:
             (specs, BY_SEED),
             donate_argnums=0,
         )
-        self._policy = spread(jax.vmap(algorithm.evaluation_policy), (seeds, BY_SEED), BY_SEED)
+        self._policies = evaluation_policies(algorithm)
         self._act_greedily = spread(
             jax.vmap(partial(greedily, algorithm), in_axes=(0, None, 0, 0, 0)),
             (BY_SEED, SHARED, BY_SEED, BY_SEED, BY_SEED),
@@ -88,7 +89,7 @@ class HostDriver:
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
         seeds, obs_size = self.layout.num_seeds, self.algorithm.spec.obs_size
         split = split_for_episodes(keys, episodes)
-        policy = self._policy(state.seeds, split[:, 0])
+        policies = self._policies(state.seeds, split[:, 0])
         env_seed = int(jax.random.randint(split[0, 1], (), 0, 2**30))
         env = self._make_env(num_envs=seeds * episodes, seed=env_seed)
         env.episode_length = self.settings.episode_length
@@ -100,7 +101,7 @@ class HostDriver:
             if not alive.any():
                 break
             states = obs.reshape(seeds, episodes, obs_size)
-            action, memory = self._act_greedily(policy, jnp.int32(t), memory, states, split[:, 1:])
+            action, memory = self._act_greedily(policies, jnp.int32(t), memory, states, split[:, 1:])
             step = env.step(np.asarray(action).reshape(count, -1))
             obs = step.obs
             total += np.where(alive, step.reward, 0.0)
