@@ -1,7 +1,6 @@
 """The fit of one model: the split, early stopping, and that it learns."""
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -46,8 +45,10 @@ def fit(linear):
 
 
 def _compiled_fit(settings, usual):
+    usual_hyper = Hyper.of(settings)
+
     @jax.jit
-    def run(model, count, key, rows=usual, hyper=Hyper.of(settings)):
+    def run(model, count, key, rows=usual, hyper=usual_hyper):
         split = dynamics.Split.draw(key, count, CAPACITY, settings.validation_block)
         whitening = dynamics.scaling(_moments(rows), jnp.int32(CAPACITY), settings)
         return dynamics.fit(model, rows, split, whitening, hyper, key, settings=settings, spec=SPEC)
@@ -110,8 +111,8 @@ def test_a_fit_stops_after_its_patience(linear, fit, key):
 
 
 def test_what_cannot_be_predicted_does_not_keep_the_rest_from_being_learned(linear, fit, key):
-    """Impacts at random moments make up nearly all of the error; the other coordinate's rule, which is new, is less than
-    the threshold of 1% of it, and is learned all the same."""
+    """Impacts at random moments make up nearly all of the error. The other coordinate's rule, which is new, is less than
+    the threshold's 1% of it, and is learned all the same."""
     settings, rows = linear
     model = fit(dynamics.init(key, Hyper.of(settings), settings, SPEC), jnp.int32(CAPACITY), key)
     impact = 10.0 * jax.random.bernoulli(key, 0.1, (CAPACITY,))
