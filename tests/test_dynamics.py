@@ -111,7 +111,7 @@ def test_a_fit_stops_after_its_patience(linear, fit, key):
 
 
 def test_what_cannot_be_predicted_does_not_keep_the_rest_from_being_learned(linear, fit, key):
-    """Impacts at random moments make up nearly all of the error. The other coordinate's rule, which is new, is less than
+    """Impacts at random moments make up nearly all of the error. The other coordinate's rule, new, is less than
     the threshold's 1% of it, and is learned all the same."""
     settings, rows = linear
     model = fit(dynamics.init(key, Hyper.of(settings), settings, SPEC), jnp.int32(CAPACITY), key)

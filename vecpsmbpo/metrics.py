@@ -141,8 +141,8 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
                 "train_episodes": int(episodes),
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
-                "real_ratio": float(ratios[seed]),
-                "temperature": _finite(float(seeds.hyper.temperature[seed])),
+                "real_ratio": _setting(ratios[seed]),
+                "temperature": _setting(seeds.hyper.temperature[seed]),
             }
         )
         if seeds.bandit is not None:
@@ -151,6 +151,6 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     return lines
 
 
-def _finite(value: float) -> float | None:
-    """JSON has no infinity."""
-    return value if np.isfinite(value) else None
+def _setting(value: jax.Array) -> float | None:
+    """A float32 as it was set: 0.2 and not 0.20000000298. None for infinity, which JSON does not have."""
+    return float(str(np.float32(value))) if np.isfinite(value) else None

@@ -1,0 +1,68 @@
+"""Runs of the same length beside each other, as CSV: python tools/compare.py RUN_DIR... [steps=N] > results/NAME.csv
+
+One line per run and swept value, over its seeds:
+    eval_last, train_last   mean return of the last `WINDOW` epochs, of mean and of sampled actions: mean over seeds and
+                            its standard error
+    eval_best               the best evaluation of each seed: mean and standard error
+    seconds                 wall time until then, compilation included
+"""
+
+import csv
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from vecpsmbpo import config, metrics
+
+WINDOW = 5  # epochs
+
+
+def _mean_and_error(values: list[float]) -> tuple[float, float]:
+    """Over seeds; the error of a single one is not known."""
+    error = np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    return float(np.mean(values)), float(error)
+
+
+def summaries(run_dir: Path, steps: int | None) -> list[dict[str, object]]:
+    """A line for each of the run's swept values."""
+    settings = config.load(run_dir)
+    lines = [
+        line for line in metrics.read(run_dir / metrics.METRICS_FILE) if steps is None or line["env_steps"] <= steps
+    ]
+    swept = [name for name, _ in settings.sweep]
+    curves: dict[tuple, dict[int, list[metrics.Line]]] = defaultdict(lambda: defaultdict(list))
+    for line in lines:
+        curves[tuple(line[name] for name in swept)][line["seed"]].append(line)
+    found = []
+    for values, seeds in curves.items():
+        row: dict[str, object] = {
+            "run": run_dir.name,
+            "task": settings.task,
+            "algo": settings.algo,
+            "swept": " ".join(f"{name}={value}" for name, value in zip(swept, values, strict=True)),
+            "seeds": len(seeds),
+            "env_steps": lines[-1]["env_steps"],
+        }
+        for name, field, take in (
+            ("eval_last", "eval_return", lambda x: np.mean(x[-WINDOW:])),
+            ("eval_best", "eval_return", np.max),
+            ("train_last", "train_return", lambda x: np.mean(x[-WINDOW:])),
+        ):
+            per_seed = [take([line[field] for line in curve if line[field] is not None]) for curve in seeds.values()]
+            row[name], row[f"{name}_se"] = _mean_and_error(per_seed)
+        found.append({**row, "seconds": lines[-1]["seconds"]})
+    return found
+
+
+def main(arguments: list[str]) -> None:
+    steps = next((int(text.removeprefix("steps=")) for text in arguments if text.startswith("steps=")), None)
+    rows = [row for text in arguments if "=" not in text for row in summaries(Path(text), steps)]
+    writer = csv.DictWriter(sys.stdout, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
