@@ -5,13 +5,11 @@ from collections import deque
 from types import TracebackType
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from vecpsmbpo import imagination
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.algorithms import Algorithm
 
 PLAIN_LINE_EVERY_S = 30.0  # where there is no terminal, besides the one at the end of each epoch
 
@@ -19,12 +17,12 @@ PLAIN_LINE_EVERY_S = 30.0  # where there is no terminal, besides the one at the 
 class Display:
     """Steps, returns, speeds and time left of one run."""
 
-    def __init__(self, settings: Settings, env_steps: int, console: Console | None = None):
-        self._settings = settings
+    def __init__(self, algorithm: Algorithm, env_steps: int, console: Console | None = None):
+        settings = self._settings = algorithm.settings
         self._console = console or Console(highlight=False, soft_wrap=True)
         self._eval_return: float | None = None
         self._train_return: float | None = None
-        self._pace = Pace(settings)
+        self._pace = Pace(algorithm)
         self._live = self._console.is_terminal
         self._printed = -PLAIN_LINE_EVERY_S
         self._progress = Progress(
@@ -92,30 +90,19 @@ class Rates(NamedTuple):
     imagined: float
 
     @classmethod
-    def over(cls, settings: Settings, env_steps: int, steps: int, seconds: float) -> "Rates":
+    def over(cls, algorithm: Algorithm, env_steps: int, steps: int, seconds: float) -> "Rates":
         """Of the `steps` steps that ended at `env_steps` and took `seconds`."""
+        settings = algorithm.settings
         learning = np.arange(max(env_steps - steps, settings.first_learning_step), env_steps)
-        refreshes = learning[learning % settings.model_update_every == 0]
-        updates = imagined = 0
-        if settings.plans:
-            rollouts = settings.plan_population * settings.plan_iterations * settings.plan_particles
-            imagined = len(learning) * rollouts * settings.plan_horizon
-        elif settings.alternates:
-            updates = len(refreshes) * settings.rounds * settings.policy_steps
-            imagined = updates * settings.policy_rollouts * settings.policy_rollout_length
-        else:
-            updates = len(learning) * settings.updates_per_step * settings.n_members
-            if settings.real_ratio < 1:
-                rows = imagination.rows_per_refresh(settings, jnp.asarray(refreshes))
-                imagined = int(np.sum(rows)) * settings.n_members
-        return cls(*(len(settings.lanes) * count / seconds for count in (steps, updates, imagined)))
+        work = algorithm.work(learning, learning[learning % settings.model_update_every == 0])
+        return cls(*(len(settings.lanes) * count / seconds for count in (steps, *work)))
 
 
 class Pace:
     """Speeds over the last refresh period, or longer chunk, and what they say of the time left."""
 
-    def __init__(self, settings: Settings):
-        self._settings = settings
+    def __init__(self, algorithm: Algorithm):
+        self._algorithm, self._settings = algorithm, algorithm.settings
         self._chunks: deque[tuple[int, float]] = deque()  # steps and seconds of each, all of one kind
         self._learning = False
         self.rates = Rates(0.0, 0.0, 0.0)
@@ -129,7 +116,7 @@ class Pace:
         # A whole period, since its refresh may take as long as the rest of it.
         while sum(steps for steps, _ in self._chunks) - self._chunks[0][0] >= self._settings.model_update_every:
             self._chunks.popleft()
-        self.rates = Rates.over(self._settings, env_steps, *map(sum, zip(*self._chunks, strict=True)))
+        self.rates = Rates.over(self._algorithm, env_steps, *map(sum, zip(*self._chunks, strict=True)))
 
     def left(self, env_steps: int) -> str:
         """Time left; a dash before learning has begun, since warm-up steps say nothing of what follows."""

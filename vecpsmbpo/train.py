@@ -101,7 +101,7 @@ class _Run:
             driver.load_env(saved.host["env"])
         self.env_steps = saved.step if saved else 0
         self.log = metrics.RunLog(self.run_dir, self.env_steps, settings.lanes[0])
-        self.display = Display(settings, self.env_steps)
+        self.display = Display(driver.algorithm, self.env_steps)
         self.memory = memory
         self.epoch_began = time.perf_counter()
         self.epoch_steps_done = 0
@@ -189,7 +189,7 @@ class _Run:
 
     def _lines(self, returns: Returns, seconds: float) -> list[metrics.Line]:
         settings = self.settings
-        rates = Rates.over(settings, self.env_steps, self.epoch_steps_done, seconds)
+        rates = Rates.over(self.driver.algorithm, self.env_steps, self.epoch_steps_done, seconds)
         return [
             {
                 **line,

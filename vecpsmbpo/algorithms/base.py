@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vecpsmbpo import dynamics, imagination, mixture, posterior, replay
 from vecpsmbpo.layout import Layout
@@ -49,6 +50,11 @@ class Algorithm(ABC):
     @abstractmethod
     def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """What happens where a period of `model_update_every` steps begins; nothing where not `enabled`."""
+
+    @abstractmethod
+    def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
+        """How many gradient steps and imagined rows there are in the steps `learning`, which learn and of which
+        `refreshes` begin with a refresh; of all members together. For the display of speeds."""
 
     def memory(self) -> Any:
         """What is remembered when an episode begins."""

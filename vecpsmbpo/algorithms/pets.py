@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vecpsmbpo import planning
 from vecpsmbpo.algorithms.base import Algorithm
@@ -37,6 +38,12 @@ class Pets(Algorithm):
 
     def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         return self.fit_models(counters, state, enabled, key)
+
+    def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
+        """A plan is made for every `plan_hold` steps, and imagines as many for each planned action."""
+        settings = self.settings
+        rollouts = settings.plan_population * settings.plan_iterations * settings.plan_particles
+        return 0, len(learning) * rollouts * settings.plan_horizon
 
     def _follow(
         self, due: jax.Array, models: Model, plan: jax.Array, obs: jax.Array, key: jax.Array

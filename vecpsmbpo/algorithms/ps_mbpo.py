@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vecpsmbpo import imagination, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
@@ -132,6 +133,14 @@ class PsMbpo(Algorithm):
             return sac.updates(agent, batches, state.hyper, key, nets=nets)
 
         return layout.map_local(update, state.agents, batches, layout.keys(update_key, ids))
+
+    def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
+        settings = self.settings
+        updates = len(learning) * settings.updates_per_step * settings.n_members
+        if settings.real_ratio == 1:
+            return updates, 0
+        rows = imagination.rows_per_refresh(settings, jnp.asarray(refreshes))
+        return updates, int(np.sum(rows)) * settings.n_members
 
     def minibatches(self, counters: Counters, state: SeedState, imagined: jax.Array, key: jax.Array) -> Transition:
         """G minibatches, each row real with probability λ, on its own (footnote 2). imagined: [C_M, F]."""

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vecpsmbpo import dynamics, imagination, multistep, trpo
 from vecpsmbpo.algorithms.base import Algorithm
@@ -88,6 +89,11 @@ class Slbo(Algorithm):
         start_key, step_key = jax.random.split(key)
         xs = jnp.arange(length), jax.random.split(step_key, length)
         return jax.lax.scan(step, real_states(start_key), xs)[1]
+
+    def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
+        settings = self.settings
+        updates = len(refreshes) * settings.rounds * settings.policy_steps
+        return updates, updates * settings.policy_rollouts * settings.policy_rollout_length
 
     @property
     def _nets(self) -> trpo.Networks:
