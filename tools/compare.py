@@ -4,6 +4,7 @@ One line per run and swept value, over its seeds:
     eval_last, train_last   mean return of the last `WINDOW` epochs, of mean and of sampled actions: mean over seeds and
                             its standard error
     eval_best               the best evaluation of each seed: mean and standard error
+    train_all               mean sampled return of all epochs: how fast it was learned
     seconds                 wall time until then, compilation included
 """
 
@@ -49,6 +50,7 @@ def summaries(run_dir: Path, steps: int | None) -> list[dict[str, object]]:
             ("eval_last", "eval_return", lambda x: np.mean(x[-WINDOW:])),
             ("eval_best", "eval_return", np.max),
             ("train_last", "train_return", lambda x: np.mean(x[-WINDOW:])),
+            ("train_all", "train_return", np.mean),
         ):
             per_seed = [take([line[field] for line in curve if line[field] is not None]) for curve in seeds.values()]
             row[name], row[f"{name}_se"] = _mean_and_error(per_seed)
