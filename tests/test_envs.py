@@ -26,7 +26,7 @@ def test_one_control_step_is_that_of_the_original(port):
     """From the same simulator state, over random actions: observation, reward and termination. `tools/parity.py` does
     the same with thousands of states."""
     name = port.env.spec.name
-    steps = parity.collect(name, parity.uniform(1, port.env.action_size, seed=0), states=150, seed=3)
+    steps = parity.collect(name, parity.uniform(1, port.env.action_size), states=150, seed=3)
     found = parity.compare_steps(port, steps)
     assert found["obs_p50"] < 1e-4
     assert found["obs_p99"] < 1e-3
