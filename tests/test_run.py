@@ -9,7 +9,7 @@ from vecpsmbpo.envs.registry import TASKS
 
 
 def _usual(name: str, backend: str):
-    """All tasks on all backends take half an hour (`pytest -m slow`): the usual tests run one of each driver."""
+    """All tasks on all backends take ten minutes (`pytest -m slow`): the usual tests run one of each driver."""
     usual = (name, backend) in (("hopper", "mjx"), ("window_open", "host"))
     return pytest.param(name, backend, marks=[] if usual else pytest.mark.slow)
 

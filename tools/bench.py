@@ -168,7 +168,7 @@ def bench_program() -> dict[str, Any]:
 def bench_envs() -> list[dict[str, Any]]:
     """Every task (or those named) on every backend that it has; actions are uniform."""
     found = []
-    for name in sys.argv[2:] or TASKS:
+    for name in sys.argv[2:] or [name for name, task in TASKS.items() if task.sizes]:
         for backend in TASKS[name].backends:
             for batch in (1, 10, 100):
                 measure = mjx_steps if backend == "mjx" else host_steps

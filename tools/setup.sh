@@ -2,4 +2,4 @@
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 python=${PYTHON:-python3}
 [ -x .venv/bin/python ] || "$python" -m venv .venv
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable ".$1"
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --use-pep517 --editable ".$1"
