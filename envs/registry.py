@@ -69,6 +69,11 @@ TASKS = {
 }
 
 
+def names(backend: str) -> list[str]:
+    """The tasks that need no options, on `backend`."""
+    return [name for name, task in TASKS.items() if task.sizes and backend in task.code]
+
+
 def resolve_backend(name: str, backend: str = "auto") -> str:
     """`mjx` or `host`; `auto` takes MJX where the task has a port.
 

@@ -8,15 +8,11 @@ import pytest
 from tests.helpers import assert_resumes_exactly
 from tools import parity
 from vecpsmbpo import envs
-from vecpsmbpo.envs import specs
-from vecpsmbpo.envs.registry import TASKS
+from vecpsmbpo.envs import registry, specs
 from vecpsmbpo.settings import SettingError
 
-PORTED = [name for name, task in TASKS.items() if task.sizes and "mjx" in task.code]
-HOSTED = [name for name, task in TASKS.items() if task.sizes and "host" in task.code]
 
-
-@pytest.fixture(scope="module", params=PORTED)
+@pytest.fixture(scope="module", params=registry.names("mjx"))
 def port(request):
     """The MJX port with its compiled functions."""
     return parity.Port(request.param)
@@ -38,7 +34,7 @@ def test_one_control_step_is_that_of_the_original(port):
 
 
 def test_sizes_are_those_of_the_registry(port):
-    spec, task = port.env.spec, TASKS[port.env.spec.name]
+    spec, task = port.env.spec, registry.TASKS[port.env.spec.name]
     host = envs.make(spec.name, "host")
     state = port.env.reset(jax.random.key(0))
     assert state.obs.shape == (task.sizes.obs_size,) == host.reset().shape[1:]
@@ -93,13 +89,13 @@ def test_hopper_s_termination_rule(z, angle, joint, ends):
     assert bool(specs.get("hopper").terminated(obs, None, obs)) == ends
 
 
-@pytest.mark.parametrize("name", HOSTED)
+@pytest.mark.parametrize("name", registry.names("host"))
 def test_host_environments_resume_exactly(name):
     env, other = (envs.make(name, "host", num_envs=2, seed=seed) for seed in (3, 99))
     assert_resumes_exactly(env, other, 40)
 
 
-@pytest.mark.parametrize("name", HOSTED)
+@pytest.mark.parametrize("name", registry.names("host"))
 def test_host_environments_keep_the_true_successor(name):
     env = envs.make(name, "host", num_envs=2, seed=0)
     env.episode_length = 5

@@ -21,7 +21,7 @@ import numpy as np
 from vecpsmbpo import config, envs, runtime
 from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.drivers.common import over_seeds
-from vecpsmbpo.envs.registry import TASKS
+from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.train import initial_inputs, make_driver
 from vecpsmbpo.types import TrainState
@@ -168,8 +168,10 @@ def bench_program() -> dict[str, Any]:
 def bench_envs() -> list[dict[str, Any]]:
     """Every task (or those named) on every backend that it has; actions are uniform."""
     found = []
-    for name in sys.argv[2:] or [name for name, task in TASKS.items() if task.sizes]:
-        for backend in TASKS[name].backends:
+    for backend in ("mjx", "host"):
+        for name in registry.names(backend):
+            if sys.argv[2:] and name not in sys.argv[2:]:
+                continue
             for batch in (1, 10, 100):
                 measure = mjx_steps if backend == "mjx" else host_steps
                 found.append({"env": name, "backend": backend, "batch": batch, **measure(name, batch)})

@@ -27,10 +27,9 @@ from rich.console import Console
 from rich.table import Table
 
 from vecpsmbpo import envs, evaluate
+from vecpsmbpo.envs import registry
 from vecpsmbpo.envs.mjx.simulator import Physics
-from vecpsmbpo.envs.registry import TASKS
 
-PORTED = [name for name, task in TASKS.items() if task.sizes and "mjx" in task.code]
 Policy = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]  # obs [..., O], t, key -> action [..., A]
 NEAR = 1e-4  # a state this close to a termination threshold may fall on either side in float32
 
@@ -194,7 +193,7 @@ def main(arguments: list[str]) -> None:
     options = dict(text.split("=", 1) for text in arguments if "=" in text and not text.startswith("run_dir="))
     states, episodes = int(options.get("states", 2000)), int(options.get("episodes", 30))
     trained = dict(trained_policy(text.split("=", 1)[1]) for text in arguments if text.startswith("run_dir="))
-    names = [text for text in arguments if "=" not in text] or PORTED
+    names = [text for text in arguments if "=" not in text] or registry.names("mjx")
     rows: list[dict[str, Any]] = []
     writer: Any = None
     for name in names:
