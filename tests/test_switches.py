@@ -89,6 +89,12 @@ def test_exp3s_by_hand():
     np.testing.assert_allclose(probs, (1 - explored) * weights / weights.sum() + explored / 4, rtol=1e-5)
 
 
+def test_short_runs_do_not_only_explore():
+    settings = dataclasses.replace(tiny(), total_steps=400, real_ratio_arms=(0.0, 0.1, 0.3, 0.5))
+    bandit = _bandit(settings, log_weights=jnp.array([0.0, -20.0, -20.0, -20.0]))
+    np.testing.assert_allclose(mixture.probabilities(bandit, settings), [0.625, 0.125, 0.125, 0.125], atol=1e-6)
+
+
 def test_an_arm_gains_by_improving_the_return():
     settings = dataclasses.replace(tiny(), total_steps=4000)
     first = mixture.end_round(_bandit(settings, arm=jnp.int32(1)), settings, jnp.float32(50.0), jax.random.key(1))
