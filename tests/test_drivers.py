@@ -202,20 +202,35 @@ def test_seeds_differ_and_are_what_they_are_alone():
     assert seeds == {0, 1}
 
 
-@pytest.mark.parametrize("policy", ["best", "average"])
-def test_other_evaluation_policies(policy):
-    settings = settings_for(eval_policy=policy)
-    driver = make_driver("scan", True, settings)
+def _four_policies(settings, driver):
+    """A state in which policy i always acts tanh(i / 4), give or take 1e-3, and the second has earned the most."""
     state = driver.init(*initial_inputs(settings))
-    nets = sac.make_networks(settings, driver.algorithm.spec)
-    # Policy i always acts tanh(i / 4); the second has earned the most.
+    assert driver.algorithm.spec.action_size == 1
     actor = jax.tree.map(jnp.zeros_like, state.seeds.agents.actor)
     bias = jnp.stack([jnp.array([i / 4, -1e3]) for i in range(4)])[None]
     actor["params"]["ReluMLP_0"]["Dense_2"]["bias"] = bias
     posterior = state.seeds.posterior.replace(returns=jnp.array([[0.0, 9e9, 0, 0]]))
     seeds = state.seeds.replace(agents=state.seeds.agents.replace(actor=actor), posterior=posterior)
-    returns = driver.evaluate(driver.layout.place(state.replace(seeds=seeds)), evaluation_keys(settings, 0), 1)
-    actions = np.tanh(np.arange(4) / 4)
-    action = actions[1] if policy == "best" else actions.mean()
-    assert nets.actor.action_size == 1
+    return driver.layout.place(state.replace(seeds=seeds))
+
+
+ACTIONS = np.tanh(np.arange(4) / 4)  # of which the probe rewards 1 - a²
+
+
+@pytest.mark.parametrize(("policy", "action"), [("best", ACTIONS[1]), ("average", ACTIONS.mean())])
+def test_other_evaluation_policies(policy, action):
+    settings = settings_for(eval_policy=policy)
+    driver = make_driver("scan", True, settings)
+    returns = driver.evaluate(_four_policies(settings, driver), evaluation_keys(settings, 0), 1)
     assert float(returns.episode_return[0, 0]) == pytest.approx(1 - action**2, abs=1e-4)
+
+
+@pytest.mark.parametrize(("policy", "members"), [("best", {1}), ("average", {0, 1, 2, 3})])
+def test_evaluation_with_sampled_actions(policy, members):
+    settings = settings_for(eval_policy=policy, eval_actions="sampled", eval_episodes=40)
+    driver = make_driver("scan", True, settings)
+    returns = driver.evaluate(_four_policies(settings, driver), evaluation_keys(settings, 0), 40).episode_return[0]
+    nearest = np.abs(np.asarray(returns)[:, None] - (1 - ACTIONS**2))
+    assert set(nearest.argmin(axis=1)) == members
+    assert nearest.min(axis=1).max() < 0.01  # one member's action, not a mean of several
+    assert np.unique(returns).size > 10  # sampled: each with noise of its own

@@ -233,6 +233,7 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None):
 EVALUATION = {
     "episodes": "eval_episodes",
     "policy": "eval_policy",
+    "actions": "eval_actions",
     "backend": "backend",
     "devices": "devices",
 }

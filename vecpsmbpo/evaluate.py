@@ -30,7 +30,8 @@ def evaluate(stored: Settings, settings: Settings) -> int:
     trained, saved = restore(stored)
     driver = trained if settings == stored else make_driver(settings)
     returns = driver.evaluate(saved.state, evaluation_keys(settings, saved.step), settings.eval_episodes)
-    table = Table(title=f"{settings.task} ({settings.backend}) at step {saved.step}, policy: {settings.eval_policy}")
+    who = f"policy: {settings.eval_policy}, {settings.eval_actions} actions"
+    table = Table(title=f"{settings.task} ({settings.backend}) at step {saved.step}, {who}")
     for column in (*settings.lanes[0], "episodes", "return", "± s.d.", "lowest", "highest", "length"):
         table.add_column(column, justify="right")
     for index, lane in enumerate(settings.lanes):
@@ -69,8 +70,8 @@ def load_policy(run_dir: str | Path) -> tuple[Settings, Callable[[jax.Array], ja
     settings = config.load(run_dir)
     if settings.plans:
         raise SettingError(f"run_dir={run_dir}: algo={settings.algo} plans its actions; there is no policy to load")
-    driver, saved = restore(replace(settings, eval_policy="best"))
+    driver, saved = restore(replace(settings, eval_policy="best", eval_actions="mean"))
     algorithm, seeds = driver.algorithm, saved.state.seeds
     policy = jax.tree.map(lambda x: x[0], evaluation_policies(algorithm)(seeds, seeds.key))
     step, key = jnp.int32(0), jax.random.key(0)  # a policy, unlike a plan, needs neither
-    return settings, jax.jit(lambda obs: algorithm.act_greedily(policy, step, algorithm.memory(), obs, key)[0])
+    return settings, jax.jit(lambda obs: algorithm.evaluation_action(policy, step, algorithm.memory(), obs, key)[0])

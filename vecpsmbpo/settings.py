@@ -51,6 +51,7 @@ class Settings:
     episode_length: int = _whole(0)
     eval_episodes: int = _whole(1)
     eval_policy: str = _choice("posterior", "best", "average")
+    eval_actions: str = _choice("mean", "sampled")
     checkpoint_every: int = _whole(1)
     devices: int = _whole(0)
     compile_cache: bool
@@ -195,7 +196,9 @@ TRACED = (
 )
 
 # Settings that a resumed run may change: they steer the loop around the run, not what it computes.
-CHANGEABLE = frozenset({"total_steps", "eval_episodes", "eval_policy", "checkpoint_every", "devices", "compile_cache"})
+CHANGEABLE = frozenset(
+    {"total_steps", "eval_episodes", "eval_policy", "eval_actions", "checkpoint_every", "devices", "compile_cache"}
+)
 
 
 def allowed(name: str) -> str:

@@ -39,13 +39,13 @@ class Algorithm(ABC):
 
     @abstractmethod
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> Any:
-        """What `act_greedily` needs of the state."""
+        """What `evaluation_action` needs of the state."""
 
     @abstractmethod
-    def act_greedily(
+    def evaluation_action(
         self, policy: Any, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, Any]:
-        """The evaluation's action [A] for obs [O] at a step of the episode, from 0, and what it will remember."""
+        """The action [A] for obs [O] at a step of an evaluation episode, from 0, and what it will remember."""
 
     @abstractmethod
     def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:

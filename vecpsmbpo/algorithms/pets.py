@@ -30,7 +30,7 @@ class Pets(Algorithm):
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> Model:
         return self.layout.all_models(state.models)
 
-    def act_greedily(
+    def evaluation_action(
         self, policy: Model, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, Any]:
         """As `choose`: planning is the same in training and evaluation."""

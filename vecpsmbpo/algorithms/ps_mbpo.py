@@ -12,6 +12,7 @@ import numpy as np
 
 from vecpsmbpo import imagination, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.networks import Actor
 from vecpsmbpo.types import Agent, Counters, Params, SeedState, Transition
 
 
@@ -24,22 +25,14 @@ class PsMbpo(Algorithm):
     # ── act ──────────────────────────────────────────────────────────────────────────────────────────────────
 
     def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
-        """An action sampled from the policy of the episode's member.
-
-        With `posterior=average` (figure 6) from the average of all members' action distributions, their mixture with
-        equal weights: a member drawn anew at every step, and its action. (Averaging the actions instead would take one
-        that none of them considers good, wherever they disagree.)
-        """
-        actor = sac.make_networks(self.settings, self.spec).actor
-        member = state.episode.member
+        """An action sampled from the policy of the episode's member, or with `posterior=average` from all members'."""
+        actors = state.agents.actor
         if self.settings.posterior == "average":
-            key, member_key = jax.random.split(key)
-            member = jax.random.randint(member_key, (), 0, self.settings.n_members)
-        action = self.layout.ask(member, state.agents.actor, lambda params: actor.law(params, obs).sample(key)[0])
-        return action, ()
+            return self._sample_mixture(actors, obs, key), ()
+        return self._sample(state.episode.member, actors, obs, key), ()
 
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> Params:
-        """Parameters for `act_greedily`, by `eval_policy`: of the member that the posterior would pick now, of the
+        """Parameters for `evaluation_action`, by `eval_policy`: of the member that the posterior would pick now, of the
         member that has earned the most, or of all members."""
         if self._evaluates_average:
             return state.agents.actor
@@ -48,15 +41,32 @@ class PsMbpo(Algorithm):
         member = jnp.argmax(scores) if self.settings.eval_policy == "best" else drawn
         return self.layout.ask(member, state.agents.actor)
 
-    def act_greedily(
+    def evaluation_action(
         self, policy: Params, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, Any]:
-        """Mean action of the evaluation policy; for `average`, averaged over the members."""
-        actor = sac.make_networks(self.settings, self.spec).actor
-        if self._evaluates_average:
-            actions = jax.vmap(lambda params: actor.law(params, obs).mode())(policy)
-            return self.layout.mean_over_members(actions), ()
-        return actor.law(policy, obs).mode(), ()
+        """The mean action, for `average` averaged over the members; or a sample, as `choose` takes it."""
+        sampled, actor = self.settings.eval_actions == "sampled", self._actor
+        if not self._evaluates_average:
+            law = actor.law(policy, obs)
+            return (law.sample(key)[0] if sampled else law.mode()), ()
+        if sampled:
+            return self._sample_mixture(policy, obs, key), ()
+        return self.layout.mean_over_members(jax.vmap(lambda params: actor.law(params, obs).mode())(policy)), ()
+
+    def _sample(self, member: jax.Array, actors: Params, obs: jax.Array, key: jax.Array) -> jax.Array:
+        """[A] an action of one member."""
+        return self.layout.ask(member, actors, lambda params: self._actor.law(params, obs).sample(key)[0])
+
+    def _sample_mixture(self, actors: Params, obs: jax.Array, key: jax.Array) -> jax.Array:
+        """[A] an action of the average of all members' action distributions (figure 6), their mixture with equal
+        weights: a member drawn anew at every step, and its action. (Averaging the actions instead would take one that
+        none of them considers good, wherever they disagree.)"""
+        key, member_key = jax.random.split(key)
+        return self._sample(jax.random.randint(member_key, (), 0, self.settings.n_members), actors, obs, key)
+
+    @property
+    def _actor(self) -> Actor:
+        return sac.make_networks(self.settings, self.spec).actor
 
     @property
     def _evaluates_average(self) -> bool:

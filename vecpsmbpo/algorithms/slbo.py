@@ -25,11 +25,12 @@ class Slbo(Algorithm):
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> Params:
         return self.layout.ask(jnp.int32(0), state.agents.policy)
 
-    def act_greedily(
+    def evaluation_action(
         self, policy: Params, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, Any]:
-        """Mean action."""
-        return jnp.clip(self._nets.policy.law(policy, obs).loc, -1.0, 1.0), ()
+        law = self._nets.policy.law(policy, obs)
+        action = law.loc if self.settings.eval_actions == "mean" else law.sample(key)
+        return jnp.clip(action, -1.0, 1.0), ()
 
     def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""

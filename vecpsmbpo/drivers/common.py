@@ -115,12 +115,12 @@ def observe_and_learn(
 
 
 def evaluation_policies(algorithm: Algorithm) -> Callable:
-    """Compiled (seeds, keys [S]) -> what `Algorithm.act_greedily` needs of every seed, leaves [S, ...]."""
+    """Compiled (seeds, keys [S]) -> what `Algorithm.evaluation_action` needs of every seed, leaves [S, ...]."""
     seeds = algorithm.layout.specs().seeds
     return algorithm.layout.spread(jax.vmap(algorithm.evaluation_policy), (seeds, BY_SEED), BY_SEED)
 
 
-def greedily(
+def evaluation_actions(
     algorithm: Algorithm, policy: Any, step: jax.Array, memory: Any, obs: jax.Array, keys: jax.Array
 ) -> tuple[jax.Array, Any]:
     """Actions [E, A] of the evaluation policy of one seed in E episodes, at the same step of each, and their memory.
@@ -129,7 +129,7 @@ def greedily(
         memory, obs, keys: leaves [E, ...]; an episode's key serves all its steps.
     """
     keys = jax.vmap(lambda key: jax.random.fold_in(key, step))(keys)
-    return jax.vmap(partial(algorithm.act_greedily, policy, step))(memory, obs, keys)
+    return jax.vmap(partial(algorithm.evaluation_action, policy, step))(memory, obs, keys)
 
 
 def many(tree: Any, *counts: int) -> Any:

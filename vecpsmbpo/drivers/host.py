@@ -15,8 +15,8 @@ from vecpsmbpo.drivers.common import (
     SHARED,
     Returns,
     begin_stride,
+    evaluation_actions,
     evaluation_policies,
-    greedily,
     many,
     observe_and_learn,
     over_seeds,
@@ -56,8 +56,8 @@ class HostDriver:
             donate_argnums=0,
         )
         self._policies = evaluation_policies(algorithm)
-        self._act_greedily = spread(
-            jax.vmap(partial(greedily, algorithm), in_axes=(0, None, 0, 0, 0)),
+        self._evaluation_actions = spread(
+            jax.vmap(partial(evaluation_actions, algorithm), in_axes=(0, None, 0, 0, 0)),
             (BY_SEED, SHARED, BY_SEED, BY_SEED, BY_SEED),
             (BY_SEED, BY_SEED),
         )
@@ -101,7 +101,7 @@ class HostDriver:
             if not alive.any():
                 break
             states = obs.reshape(seeds, episodes, obs_size)
-            action, memory = self._act_greedily(policies, jnp.int32(t), memory, states, split[:, 1:])
+            action, memory = self._evaluation_actions(policies, jnp.int32(t), memory, states, split[:, 1:])
             step = env.step(np.asarray(action).reshape(count, -1))
             obs = step.obs
             total += np.where(alive, step.reward, 0.0)

@@ -16,7 +16,7 @@ from vecpsmbpo.drivers.common import (
     SHARED,
     Returns,
     begin_stride,
-    greedily,
+    evaluation_actions,
     many,
     observe_and_learn,
     over_seeds,
@@ -127,7 +127,7 @@ class ScanDriver:
 
             def step(carry):
                 t, memory, env, total, length, alive = carry
-                action, memory = greedily(self.algorithm, policy, t, memory, env.obs, keys[1:])
+                action, memory = evaluation_actions(self.algorithm, policy, t, memory, env.obs, keys[1:])
                 env = jax.vmap(self.env.step)(env, action)
                 total = total + jnp.where(alive, env.reward, 0.0)
                 return t + 1, memory, env, total, length + alive, alive & (env.done == 0)
