@@ -67,19 +67,24 @@ def environment() -> dict[str, str]:
 
 
 def check_log(run_dir: Path, settings) -> None:
-    """Every epoch and episode exactly once, with every field."""
-    epochs = metrics.read(run_dir / "metrics.jsonl")
-    seeds = range(settings.seed, settings.seed + settings.num_seeds)
-    steps = range(settings.epoch_steps, settings.total_steps + 1, settings.epoch_steps)
-    assert sorted((line["env_steps"], line["seed"]) for line in epochs) == [(t, s) for t in steps for s in seeds]
-    assert all(set(line) >= METRICS for line in epochs)
-    episodes = metrics.read(run_dir / "episodes.jsonl")
-    for seed in seeds:
-        own = [line for line in episodes if line["seed"] == seed]
+    """Every epoch and episode of every lane exactly once, with every field."""
+    lanes = [tuple(metrics._lane(settings, index).items()) for index in range(len(settings.lanes))]
+    names = [name for name, _ in lanes[0]]
+
+    def of(lane, lines):
+        return [line for line in lines if tuple((name, line[name]) for name in names) == lane]
+
+    epochs, episodes = (metrics.read(run_dir / name) for name in ("metrics.jsonl", "episodes.jsonl"))
+    steps = list(range(settings.epoch_steps, settings.total_steps + 1, settings.epoch_steps))
+    assert len(epochs) == len(lanes) * len(steps)
+    for lane in lanes:
+        assert [line["env_steps"] for line in of(lane, epochs)] == steps
+        own = of(lane, episodes)
         assert [line["episode"] for line in own] == list(range(1, len(own) + 1))
-        assert all(set(line) == EPISODE for line in own)
+        assert all(set(line) == EPISODE | set(names) for line in own)
         assert sum(line["length"] for line in own) > settings.total_steps - settings.episode_length
         assert np.allclose([np.sum(line["probs"]) for line in own], 1.0, atol=1e-5)
+    assert all(set(line) >= METRICS | set(names) for line in epochs)
     assert list((run_dir / "tensorboard").iterdir())
 
 

@@ -66,10 +66,10 @@ class ProbeSimulator(Simulator):
         self._obs = 0.0
         return np.array([0.0])
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         reward, terminated = self._obs * (1 - action[0] ** 2), self._obs > 0.5 and self._terminates
         self._obs = 1 - self._obs
-        return np.array([self._obs]), reward, terminated
+        return np.array([self._obs]), reward, terminated, False
 
     def save(self) -> dict[str, Any]:
         return {"obs": self._obs}

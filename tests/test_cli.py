@@ -33,6 +33,15 @@ MISTAKES = [
     (["train", "compile_cache=maybe"], "compile_cache=maybe: must be true or false"),
     (["train", "total_steps=1500"], "total_steps=1500: must be a multiple of epoch_steps=1000"),
     (["train", "model_update_every=300"], "model_update_every=300: must divide epoch_steps=1000"),
+    (["train", "algo=slbo", "posterior=average"], "posterior=average: there are no policies to average"),
+    (["train", "algo=sac", "real_ratio=0.5"], "real_ratio: must be 1 with algo=sac"),
+    (["train", "algo=pets", "sweep.real_ratio=[0,1]"], "real_ratio: must be 0 with algo=pets"),
+    (["train", "algo=sac", "n_models=5"], "n_models=5: must be 1 with algo=sac"),
+    (["train", "algo=pets", "n_policies=2"], "n_policies=2: must be 1 with algo=pets"),
+    (["train", "real_ratio_schedule=linear", "sweep.real_ratio=[0,1]"], "sweep.real_ratio: needs real_ratio_schedule"),
+    (["train", "validation_ratio=0.3"], "validation_ratio=0.3: must be 1 / k"),
+    (["train", "seed=2147483647", "num_seeds=2"], "num_seeds=2: the last seed"),
+    (["train", "env=hopper", "imagined_capacity=10"], "imagined_capacity=10: must hold a rollout, of up to 15 steps"),
     (["train", "n_models=1,2"], "n_models=1,2: several values need -m"),
     (["train", "hopper"], "hopper: must be name=value"),
     (["train", "-m", "n_models=1,0"], "n_models=0: must be a whole number, at least 1"),
@@ -207,8 +216,18 @@ def test_a_resumed_run_may_be_prolonged(tmp_path):
     assert again.total_steps == 400
 
 
-def test_a_damaged_config_is_named(tmp_path):
-    (tmp_path / "config.yaml").write_text(json.dumps({"env": "hopper"}))
+def test_a_run_from_before_a_setting_existed_is_read_with_its_default(tmp_path):
+    settings = config.compose(["size=tiny", f"run_dir={tmp_path}"])
+    config.save(settings, tmp_path)
+    text = (tmp_path / "config.yaml").read_text()
+    assert text.count("eval_actions: mean\n") == 1
+    (tmp_path / "config.yaml").write_text(text.replace("eval_actions: mean\n", ""))
+    assert config.load(tmp_path) == settings
+
+
+@pytest.mark.parametrize("text", [json.dumps({"env": "hopper"}), "", "[1, 2]", "{"])
+def test_a_damaged_config_is_named(tmp_path, text):
+    (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(SettingError, match=r"its config\.yaml cannot be read"):
         config.load(tmp_path)
 
@@ -234,14 +253,25 @@ def test_every_run_of_every_experiment_composes(experiment, size):
 
 def test_an_experiment_runs_from_the_command_line(tmp_path):
     """Two runs of figure 6, made cheap: one samples policies and one averages them."""
-    small = ["size=tiny", "env=ball_in_cup", "backend=host", "n_policies=1", "num_seeds=1", "total_steps=40"]
-    result = command("train", "-m", "experiment=fig6", *small, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    small = ["size=tiny", "env=ball_in_cup", "backend=host", "n_policies=1", "num_seeds=1"]
+    for total in (40, 80):  # the second time it goes on with each
+        result = command("train", "-m", "experiment=fig6", *small, f"total_steps={total}", cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+    assert result.stdout.count("resuming at step 40") == 2
     runs = sorted((tmp_path / "runs" / "fig6").iterdir())
     assert ["average" in run.name for run in runs] == [True, False]
     for run in runs:
         assert config.load(run).posterior == ("average" if "average" in run.name else "sample")
-        assert (run / "metrics.jsonl").read_text().count("\n") == 1
+        assert (run / "metrics.jsonl").read_text().count("\n") == 2
+    assert {path.name for path in tmp_path.iterdir()} == {"runs"}
+
+
+def test_a_run_of_a_grid_that_cannot_be_is_one_line_and_the_others_go_on(tmp_path):
+    small = ["env=ball_in_cup", "backend=host", "size=tiny", "total_steps=40"]
+    result = command("train", "-m", *small, "algo=slbo", "n_models=2,1", cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.splitlines() == ["vecpsmbpo: n_models=2: must be 1 with algo=slbo"]
+    assert [run.name[-9:] for run in (tmp_path / "runs").iterdir() if run.is_dir()] == ["n_models1"]
 
 
 def test_swept_values_are_kept_with_the_run(tmp_path):

@@ -62,6 +62,21 @@ def test_prediction_adds_the_residual_to_the_state_and_whitens_its_inputs(key):
     np.testing.assert_allclose(plain[0], moved[0], atol=1e-6)
 
 
+def test_predictions_are_drawn_with_the_network_s_variance(key):
+    """Equation 21: a raw log-variance of 0 is -0.126877 after A.1's clamp, a deviation of 0.93853."""
+    settings, spec = tiny(), specs.get("ball_in_cup")
+    model = dynamics.init(key, Hyper.of(settings), settings, spec)
+    model = model.replace(params=jax.tree.map(jnp.zeros_like, model.params))
+    net = dynamics.network(settings, spec)
+    obs, action = jnp.full((20_000, spec.obs_size), 5.0), jnp.zeros((20_000, spec.action_size))
+    draw = jax.jit(partial(dynamics.predict, net=net, spec=spec))
+    next_obs, reward, _ = draw(model, obs, action, key)
+    np.testing.assert_allclose(np.mean(next_obs, axis=0), 5.0, atol=0.04)
+    np.testing.assert_allclose(np.std(next_obs, axis=0), 0.93853, rtol=0.03)
+    assert np.std(reward) == pytest.approx(0.93853, rel=0.03)
+    assert abs(np.corrcoef(next_obs[:, 0], reward)[0, 1]) < 0.03  # independently
+
+
 def test_whitening_uses_the_data_s_mean_and_standard_deviation():
     rows = np.random.default_rng(0).normal(5.0, 3.0, size=(40, 3))
     rows[:, 1] = 7.0  # never varies: left unscaled
@@ -158,13 +173,28 @@ def test_critic_loss_by_hand(key, agent):
     assert q_mean == 0
 
 
-def test_actor_loss_is_the_kl_divergence_up_to_a_constant(key, agent):
-    """Equations 25 and 28 at α = 1: with Q = 0 everywhere the loss is E[log π]."""
+def _answering(critic, first, second):
+    """Parameters of a twin critic whose Q_1 and Q_2 are these constants."""
+    critic = jax.tree.map(jnp.zeros_like, critic)
+    for name, value in (("first", first), ("second", second)):
+        layers = critic["params"][name]
+        layers[sorted(layers)[-1]]["bias"] = jnp.array([value])
+    return critic
+
+
+@pytest.mark.parametrize("values", [(2.0, 5.0), (5.0, 2.0)])
+def test_losses_take_the_smaller_of_the_two_critics(values, key, agent):
+    """Equations 24 to 29 with constant critics, Q = 2 and 5, α = 1/2, γ = 0.9: the actor's loss is E[log π] / 2 - 2,
+    the target 1 + 0.9 (2 - log π / 2)."""
     spec, nets, agent, _ = agent
-    zero = jax.tree.map(jnp.zeros_like, agent.critic)
-    actor_loss = jax.jit(partial(sac.actor_loss, nets=nets))
-    loss, log_prob = actor_loss(agent.actor, zero, jnp.float32(1.0), _batch(spec).obs, key)
-    assert loss == pytest.approx(float(log_prob))
+    batch, alpha = _batch(spec, reward=jnp.ones(2)), jnp.float32(0.5)
+    loss, log_prob = sac.actor_loss(agent.actor, _answering(agent.critic, *values), alpha, batch.obs, key, nets=nets)
+    assert loss == pytest.approx(0.5 * float(log_prob) - 2, abs=1e-5)
+    _, log_prob = nets.actor.law(agent.actor, batch.next_obs).sample(key)
+    target = 1 + 0.9 * (2 - 0.5 * np.asarray(log_prob))
+    learner = agent.replace(target_critic=_answering(agent.critic, *values), log_alpha=jnp.log(alpha))
+    loss, _ = sac.critic_loss(_answering(agent.critic, 0.0, 1.0), learner, batch, jnp.float32(0.9), key, nets=nets)
+    assert loss == pytest.approx(0.5 * np.mean(target**2 + (1 - target) ** 2), rel=1e-5)
 
 
 def test_temperature_moves_towards_the_target_entropy(key, agent):
@@ -198,6 +228,11 @@ def test_horizon_schedule(task, corners):
         assert imagination.horizon(settings, jnp.int32(1000 * epoch)) == horizon, epoch
 
 
+def test_the_horizon_grows_from_epoch_to_epoch_and_not_within():
+    settings = tiny(horizon_first=1, horizon_last=15, horizon_ramp_start=20, horizon_ramp_end=100)
+    assert [int(imagination.horizon(settings, jnp.int32(t))) for t in (25_000, 25_999, 26_000)] == [1, 1, 2]
+
+
 def test_horizon_schedule_may_fall():
     settings = tiny(horizon_first=9, horizon_last=1, horizon_ramp_start=0, horizon_ramp_end=8)
     for epoch, horizon in {0: 9, 4: 5, 8: 1, 9: 1}.items():
@@ -215,6 +250,19 @@ def test_longer_rollouts_start_from_fewer_states_and_are_never_cut():
         starts = chunk * int(imagination.chunks_per_refresh(settings, jnp.int32(horizon)))
         assert starts == (100_000 if horizon <= 10 else capacity // (horizon * chunk) * chunk)
         assert starts * horizon <= capacity
+
+
+@pytest.mark.parametrize(
+    ("starts", "capacity", "horizon"), [(100_003, 10**6, 1), (100_000, 50_000, 25), (10_000, 7, 7)]
+)
+def test_chunks_are_large_and_the_ring_holds_a_rollout_of_each(starts, capacity, horizon):
+    """Also of a prime number of starts, and in a ring that is small for the horizon."""
+    settings = tiny(rollout_starts=starts, imagined_capacity=capacity, horizon_last=horizon)
+    chunk, ring = imagination.chunk_size(settings), imagination.ring_capacity(settings)
+    chunks = int(imagination.chunks_per_refresh(settings, jnp.int32(horizon)))
+    assert chunk * horizon * chunks <= ring <= capacity
+    assert chunk >= min(2000, capacity // horizon // 2)
+    assert chunk * chunks > 0.9 * min(starts, capacity // horizon) - chunk
 
 
 def _batch(spec, reward=None) -> Transition:

@@ -115,11 +115,14 @@ def test_a_rollout_that_terminates_is_stored_and_begins_again_from_a_real_state(
     assert np.isin(data.obs[16:24, 1], np.arange(ROWS)).all()
 
 
-def test_mbpo_draws_a_model_for_every_row():
-    settings = tiny(algo="mbpo", n_models=N, rollout_starts=600)
+def test_mbpo_draws_a_model_for_every_row_and_step():
+    settings = tiny(algo="mbpo", n_models=N, rollout_starts=900, horizon_first=3, horizon_last=3)
     (data,), _ = imagine(settings)  # one policy
     n = np.round(data.reward).astype(int)
     assert scipy.stats.chisquare(np.bincount(n, minlength=N)).pvalue > 1e-4
     # The whole answer is one model's.
     np.testing.assert_allclose(data.next_obs[:, 0] - data.obs[:, 0], n + 1, atol=0.04)
     np.testing.assert_allclose(data.reward, n, atol=0.04)
+    # The model of a row's second step says nothing of the one of its third.
+    pairs = np.bincount(n[900:1800] * N + n[1800:], minlength=N * N)
+    assert scipy.stats.chisquare(pairs).pvalue > 1e-4

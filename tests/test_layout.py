@@ -11,7 +11,7 @@ from tests.helpers import algorithm, initial, tiny
 from vecpsmbpo import sac
 from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs import specs
-from vecpsmbpo.layout import Layout
+from vecpsmbpo.layout import Layout, _mesh_shape
 from vecpsmbpo.train import initial_inputs
 from vecpsmbpo.types import Counters, TrainState
 
@@ -139,3 +139,24 @@ def test_saving_rings_leaves_them_to_be_overwritten_in_place():
     assert len(layout.rings_to_host(ring, 4)) == 4
     after = jax.jit(lambda x: x.at[..., 0].set(1.0), donate_argnums=0, out_shardings=ring.sharding)(ring)
     assert shards(after) == before
+
+
+@pytest.mark.parametrize(
+    ("lanes", "parts", "most", "shape"),
+    [
+        (1, 3, 2, (1, 2)),
+        (2, 3, 2, (2, 1)),
+        (3, 1, 2, (1, 1)),  # a second device could only run padding
+        (3, 2, 2, (1, 2)),
+        (10, 4, 8, (2, 4)),
+        (1, 25, 64, (1, 25)),
+        (5, 1, 4, (1, 1)),
+        (6, 25, 4, (2, 2)),
+    ],
+)
+def test_the_mesh_gives_the_busiest_device_least_to_do(lanes, parts, most, shape):
+    found = _mesh_shape(lanes, parts, most)
+    work = lambda s, m: lanes // s * -(-parts // m)  # noqa: E731
+    assert lanes % found[0] == 0
+    assert work(*found) == work(*shape)
+    assert found[0] * found[1] <= shape[0] * shape[1] <= most

@@ -29,10 +29,10 @@ def test_steps_are_those_of_the_suite(task):
         np.testing.assert_array_equal(ours.reset(), suite.reset()[0])
         for _ in range(80):
             action = random.uniform(-1, 1, 4)
-            obs, reward, terminated, _, _ = suite.step(action)
-            our_obs, our_reward, our_terminated = ours.step(action)
+            obs, *rest, _ = suite.step(action)
+            our_obs, *our_rest = ours.step(action)
             np.testing.assert_array_equal(our_obs, obs)
-            assert (our_reward, our_terminated) == (reward, terminated)
+            assert our_rest == rest  # reward, terminated, truncated
 
 
 def test_a_layout_is_one_task_of_metaworld_s_benchmarks():
@@ -101,7 +101,7 @@ def test_the_reward_at_a_window_placed_by_hand(travel, reward):
     simulator = WindowOpenSimulator(0, threshold=0.03)
     closed = simulator.reset()[HANDLE][0]
     simulator.env.data.joint("window_slide").qpos[0] = travel
-    obs, ours, terminated = simulator.step(np.zeros(4))
+    obs, ours, terminated, _ = simulator.step(np.zeros(4))
     assert obs[HANDLE][0] - closed == pytest.approx(travel, abs=2e-4)  # it stayed there
     assert (ours, terminated) == (reward, False)
 
@@ -136,7 +136,7 @@ def test_every_task_resumes_exactly(task):
         other.load(json.loads(json.dumps(one.save(), allow_nan=False)))
         for _ in range(2):
             for action in random.uniform(-1, 1, (25, 4)):
-                (obs, reward, _), (other_obs, other_reward, _) = one.step(action), other.step(action)
+                (obs, reward, *_), (other_obs, other_reward, *_) = one.step(action), other.step(action)
                 np.testing.assert_array_equal(obs, other_obs)
                 assert reward == other_reward
             np.testing.assert_array_equal(one.reset(), other.reset())

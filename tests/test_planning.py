@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests import helpers
 from tests.helpers import tiny
 from tests.test_drivers import make_driver
 from tests.test_imagination import constant
@@ -102,6 +103,27 @@ def test_each_action_is_held_and_reaches_the_model(key):
     np.testing.assert_allclose(returns, [states.sum(), 0.0], atol=0.15)
 
 
+def test_a_plan_goes_on_from_the_one_before(monkeypatch):
+    """The next search begins at the former plan, one action later; without a plan due, the former one is kept."""
+    settings = tiny(algo="pets", devices=1)
+    learner = helpers.algorithm(settings, SPEC)
+    starts = []
+
+    def search(value, mean, key, settings):
+        starts.append(mean)
+        return mean + 10
+
+    monkeypatch.setattr(planning, "cross_entropy", search)
+    plan = jnp.arange(3.0)[:, None]
+    with jax.disable_jit():
+        action, following = learner._follow(jnp.bool_(True), None, plan, jnp.zeros(1), jax.random.key(0))
+        kept = learner._follow(jnp.bool_(False), None, plan, jnp.zeros(1), jax.random.key(0))
+    np.testing.assert_array_equal(starts[0][:, 0], [1, 2, 0])
+    np.testing.assert_array_equal(following[:, 0], [11, 12, 10])
+    assert action[0] == 11
+    np.testing.assert_array_equal(kept[1], plan)
+
+
 @pytest.mark.parametrize("kind", ["scan", "host"])
 def test_a_run_plans_well(kind):
     """On the probe (reward 1 - a² at every other step) the planned action is near 0, in one device's share of two."""
@@ -113,6 +135,7 @@ def test_a_run_plans_well(kind):
     driver = make_driver(kind, False, settings)
     state, news = driver.run(driver.init(*initial_inputs(settings)), settings.epoch_steps // settings.stride)
     lines = metrics.episode_lines(news, 0, settings)
+    np.testing.assert_array_equal(state.seeds.memory, 0)  # an episode has just ended; its plan is forgotten
     planned = [line["return"] for line in lines if not line["random"]]
     assert np.mean(planned[-10:]) > 0.85
     assert {(line["model"], line["policy"], len(line["probs"])) for line in lines} == {(0, 0, 1)}

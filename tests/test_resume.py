@@ -1,6 +1,7 @@
 """A run that is killed, stopped, damaged or diverges, and goes on: through the command line and in this process."""
 
 import dataclasses
+import errno
 import json
 import os
 import re
@@ -76,7 +77,8 @@ def test_a_run_killed_again_and_again_is_the_undisturbed_run(undisturbed, tmp_pa
     assert_same_run(tmp_path / "run", undisturbed)
 
 
-def test_a_signal_saves_and_says_how_to_go_on(undisturbed, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_saves_and_says_how_to_go_on(number, undisturbed, tmp_path):
     process = subprocess.Popen(
         argv("train", *SMALL, "run_dir=run", one_thread=True),
         cwd=tmp_path,
@@ -89,10 +91,10 @@ def test_a_signal_saves_and_says_how_to_go_on(undisturbed, tmp_path):
     for line in process.stdout:
         said += line
         if line.startswith("step"):
-            process.send_signal(signal.SIGTERM)
+            process.send_signal(number)
             break
     rest, errors = process.communicate(timeout=300)
-    assert process.returncode == 128 + signal.SIGTERM, errors
+    assert process.returncode == 128 + number, errors
     assert "to continue: vecpsmbpo train run_dir=run" in said + rest
     assert "Traceback" not in errors
     saved = int(re.search(r"saved at step (\d+) of 200", said + rest).group(1))
@@ -129,7 +131,7 @@ def test_a_finished_run_says_so(undisturbed):
 
 
 def test_evaluation_of_a_run(undisturbed):
-    result = command("eval", "run_dir=run", "episodes=2", "backend=host", cwd=undisturbed.parent)
+    result = command("eval", "run_dir=run", "episodes=2", "backend=host", "devices=2", cwd=undisturbed.parent)
     assert result.returncode == 0, result.stderr
     assert "cartpole_swingup (host) at step 200" in result.stdout
     assert len(re.findall(r"│ +[01] │ +2 │", result.stdout)) == 2
@@ -175,17 +177,67 @@ def test_a_policy_is_loaded_from_a_run(short_run):
     np.testing.assert_allclose(act(obs), np.tanh(loc), atol=1e-5)
 
 
+def _damage(run_dir: Path, step: int) -> None:
+    """Cuts every file of a checkpoint's arrays in half."""
+    for file in (run_dir / "checkpoints" / str(step) / "state").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def _files(run_dir: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in run_dir.rglob("*") if path.is_file()}
+
+
 def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(short_run, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(short_run.run_dir, folder)
-    for file in (folder / "checkpoints" / "120" / "state").rglob("*"):
-        if file.is_file():
-            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    assert train.train(dataclasses.replace(short_run, run_dir=str(folder))) == 0
+    settings = dataclasses.replace(short_run, run_dir=str(folder))
+    _damage(folder, 120)
+    before = _files(folder)
+    assert evaluate.restore(settings)[1].step == 80
+    assert _files(folder) == before  # looking at a run changes nothing
+    assert train.train(settings) == 0
     printed = capsys.readouterr()
     assert "the checkpoint at step 120 is damaged; taking the one before it" in printed.err
     assert "resuming at step 80" in printed.out
     check_log(folder, short_run)
+    assert evaluate.restore(settings)[1].step == 120
+
+
+def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    _damage(folder, 120)
+    _damage(folder, 80)
+    logs = {name: (folder / name).read_bytes() for name in ("metrics.jsonl", "episodes.jsonl")}
+    with pytest.raises(SettingError, match="holds checkpoints, but none that can be read"):
+        train.train(dataclasses.replace(short_run, run_dir=str(folder)))
+    assert {name: (folder / name).read_bytes() for name in logs} == logs
+    assert {path.name for path in (folder / "checkpoints").iterdir()} >= {"80", "120"}
+
+
+def test_a_run_is_trained_by_one_process_at_a_time(short_run):
+    with train._alone_in(Path(short_run.run_dir)), pytest.raises(SettingError, match="another process is training"):
+        train.train(short_run)
+
+
+def test_a_disk_that_fills_up_stops_the_run_in_one_line(short_run, tmp_path, monkeypatch):
+    """Not at the check before a save, but while a line is written; the checkpoint before it is whole."""
+    append = metrics._append
+
+    def full(path, lines):
+        if any(line["env_steps"] > 60 for line in lines):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(path, lines)
+
+    monkeypatch.setattr(metrics, "_append", full)
+    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
+    with pytest.raises(train.DiskError, match=r"cannot be written \(No space left on device\)"):
+        train.train(settings)
+    monkeypatch.undo()
+    assert evaluate.restore(settings)[1].step == 40
+    assert train.train(settings) == 0
+    check_log(tmp_path / "run", settings)
 
 
 def test_divergence_stops_the_run_and_says_where(short_run, tmp_path, monkeypatch):

@@ -1,7 +1,11 @@
 """Whole runs through the command line: every task and driver, and several at once."""
 
+import math
+from importlib import resources
+
 import numpy as np
 import pytest
+import yaml
 
 from tests.helpers import METRICS, check_log, command
 from vecpsmbpo import config, metrics
@@ -32,11 +36,35 @@ def test_every_task_runs_end_to_end_and_resumes_on_every_backend(name, backend, 
     check_log(tmp_path / "run", settings)
     last = metrics.read(tmp_path / "run" / "metrics.jsonl")[-1]
     assert all(np.isfinite(last[field]) for field in METRICS - {"train_return"})
+    assert last["compile_seconds"] > 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", config.options("experiment"))
+def test_every_experiment_runs(experiment, tmp_path):
+    """All that it compares, on the task of it that compiles fastest and with at most two models and policies."""
+    tasks, quick = _swept(experiment, "env"), ("ball_in_cup", "cartpole_swingup_sparse", "window_open", "hopper")
+    narrowed = [f"env={next(task for task in quick if task in tasks)}"]
+    fewer = [f"{name}=1,2" for name in ("n_models", "n_policies") if len(_swept(experiment, name)) > 2]
+    chosen = [f"experiment={experiment}", "size=tiny", "total_steps=80", *narrowed, *fewer]
+    result = command("train", "-m", *chosen, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    runs = list((tmp_path / "runs" / experiment).iterdir())
+    expected = math.prod(len(_swept(experiment, name)) for name in ("algo", "posterior", "real_ratio_schedule"))
+    assert len(runs) == expected * 2 ** len(fewer)
+    for run in runs:
+        check_log(run, config.load(run))
+
+
+def _swept(experiment: str, name: str) -> list[str]:
+    """The values of a setting in an experiment's grid; [""] where it is not in it."""
+    text = (resources.files("vecpsmbpo.configs") / "experiment" / f"{experiment}.yaml").read_text()
+    return str(yaml.safe_load(text)["hydra"]["sweeper"]["params"].get(name, "")).split(",")
 
 
 def test_multirun_runs_every_value(tmp_path):
-    common = ["env=ball_in_cup", "backend=host", "size=tiny", "total_steps=40", "n_models=1", "n_policies=1"]
+    common = ["env=ball_in_cup", "backend=host", "size=tiny", "total_steps=80", "n_models=1", "n_policies=1"]
     result = command("train", "-m", *common, "real_ratio=0.0,1.0", cwd=tmp_path)
     assert result.returncode == 0, result.stderr + result.stdout
-    ratios = [config.load(folder).real_ratio for folder in sorted((tmp_path / "runs").iterdir())]
+    ratios = [config.load(folder).real_ratio for folder in (tmp_path / "runs").iterdir() if folder.is_dir()]
     assert sorted(ratios) == [0.0, 1.0]

@@ -1,4 +1,4 @@
-"""The MJX step against C MuJoCo where MJX's own differs: contact tangents, quaternions, the line search."""
+"""The MJX step against C MuJoCo where MJX's own differs: contact tangents, quaternions; and what a task makes of it."""
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,8 @@ import pytest
 from mujoco import mjx
 
 from vecpsmbpo.envs.mjx import contacts, simulator
+from vecpsmbpo.envs.mjx.base import MjxEnv
+from vecpsmbpo.types import EnvSpec
 
 CAPSULE = """
 <mujoco><option cone="pyramidal"/><worldbody>
@@ -76,3 +78,39 @@ def test_models_with_activations_are_refused():
       <actuator><general joint="j" dyntype="integrator"/></actuator></mujoco>"""
     with pytest.raises(NotImplementedError, match="activations"):
         simulator.Simulator(mujoco.MjModel.from_xml_string(xml))
+
+
+class Slider(MjxEnv):
+    """Moves along x; ends where the action pushes away from the origin, which the new observation does not tell."""
+
+    spec = EnvSpec("slider", 1, 1, 10, lambda obs, action, next_obs: obs[..., 0] * action[..., 0] > 0)
+
+    def __init__(self):
+        super().__init__(mujoco.MjModel.from_xml_string(SLIDER), substeps=2)
+
+    def initial_state(self, key):
+        return jnp.ones(1), jnp.zeros(1)
+
+    def observe(self, physics):
+        return physics.qpos
+
+    def reward(self, before, action, after):
+        return after.qpos[0]
+
+
+SLIDER = """
+<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body></worldbody>
+<actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>
+"""
+
+
+def test_a_rule_of_termination_gets_the_state_before_the_action_and_the_state_after():
+    env = Slider()
+    state = env.reset(jax.random.key(0))
+    step = jax.jit(env.step)
+    assert [float(step(state, jnp.array([a])).done) for a in (-1.0, 1.0)] == [0, 1]
+
+
+def test_tasks_keep_their_model_s_line_search_unless_they_say_otherwise():
+    """A task of one's own is not a ported one, on which fewer iterations were seen to suffice."""
+    assert Slider()._simulator._model.opt.ls_iterations == mujoco.MjModel.from_xml_string(SLIDER).opt.ls_iterations

@@ -65,6 +65,18 @@ def test_the_linear_schedule_has_the_constant_s_area(mean):
     assert np.ptp(np.diff(falling)) < 1e-5  # a straight line
 
 
+@pytest.mark.parametrize("mean", [0.05, 0.3, 0.8])
+def test_of_a_run_s_updates_the_linear_schedule_uses_as_many_real_rows_as_the_constant(mean):
+    """Nothing is learned during the warm-up, here a third of the run: the line begins after it."""
+    settings = tiny(
+        real_ratio_schedule="linear", real_ratio=mean, total_steps=12_000, warmup_steps=4_000, replay_capacity=5000
+    )
+    hyper, steps = Hyper.of(settings), jnp.arange(settings.first_learning_step, settings.total_steps)
+    ratios = jax.vmap(lambda t: mixture.real_ratio(settings, hyper, None, t))(steps)
+    assert float(ratios.mean()) == pytest.approx(mean, abs=1e-3)
+    assert float(ratios[0]) == 1
+
+
 @pytest.mark.parametrize("mean", [0.0, 1.0])
 def test_the_linear_schedule_of_no_or_only_real_data_is_constant(mean):
     np.testing.assert_allclose(mixture.linear(jnp.float32(mean), jnp.array([0.01, 0.5, 0.99])), mean)
@@ -75,13 +87,13 @@ def _bandit(settings, **changes):
 
 
 def test_exp3s_by_hand():
-    """K = 4 arms, T = 100 rounds, weights 1, arm 2 gains 0.75."""
-    settings = dataclasses.replace(tiny(), total_steps=4000, real_ratio_arms=(0.0, 0.1, 0.3, 0.5))
-    explored = math.sqrt(4 * (math.log(400) + math.e) / ((math.e - 1) * 100))
-    assert mixture.rates(settings) == (pytest.approx(explored), 0.01)
+    """K = 4 arms, T = 200 rounds, weights 1, arm 2 gains 0.75."""
+    settings = dataclasses.replace(tiny(), total_steps=8040, real_ratio_arms=(0.0, 0.1, 0.3, 0.5))  # 40 are warm-up
+    explored = math.sqrt(4 * (2 * math.log(800) + math.e) / ((math.e - 1) * 200))
+    assert mixture.rates(settings) == (pytest.approx(explored), 0.005)
     grown = np.ones(4)
     grown[2] = math.exp(explored * (0.75 / 0.25) / 4)
-    weights = grown + math.e * 0.01 / 4 * 4
+    weights = grown + math.e * 0.005 / 4 * 4
     bandit = _bandit(settings, arm=jnp.int32(2))
     learned = mixture.reinforce(bandit, settings, jnp.float32(0.75))
     np.testing.assert_allclose(np.exp(learned), weights / weights.max(), rtol=1e-5)
@@ -97,8 +109,10 @@ def test_short_runs_do_not_only_explore():
 
 def test_an_arm_gains_by_improving_the_return():
     settings = dataclasses.replace(tiny(), total_steps=4000)
-    first = mixture.end_round(_bandit(settings, arm=jnp.int32(1)), settings, jnp.float32(50.0), jax.random.key(1))
-    np.testing.assert_array_equal(first.log_weights, 0)  # nothing to compare with yet
+    first = _bandit(settings, arm=jnp.int32(1))
+    for episode_return in (0.0, 50.0):  # nothing to compare with yet, and no scale
+        first = mixture.end_round(first, settings, jnp.float32(episode_return), jax.random.key(1))
+        np.testing.assert_array_equal(first.log_weights, 0)
     for episode_return, sign in ((80.0, 1), (20.0, -1)):
         second = mixture.end_round(
             first.replace(arm=jnp.int32(3)), settings, jnp.float32(episode_return), jax.random.key(2)
@@ -240,3 +254,25 @@ def test_nothing_changes_where_nothing_is_switched_on():
     _, _, plain, _, _ = run()
     _, _, barely, _, _ = run(forced_exploration=1e-9)
     jax.tree.map(np.testing.assert_array_equal, plain.seeds.agents.actor, barely.seeds.agents.actor)
+
+
+@pytest.mark.parametrize(
+    "switched",
+    [{"real_ratio_schedule": "bandit", "real_ratio_arms": [0.4]}, {"sweep.prior_scale": [0.0]}],
+    ids=["a bandit of one arm", "a prior of no weight"],
+)
+def test_a_switch_that_makes_no_difference_changes_no_number(switched):
+    _, _, plain, _, _ = run(real_ratio=0.4)
+    _, _, other, _, _ = run(real_ratio=0.4, **switched)
+    np.testing.assert_array_equal(plain.seeds.real, other.seeds.real)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), plain.seeds.agents.actor, other.seeds.agents.actor
+    )
+
+
+def test_averaging_changes_nothing_before_policies_act():
+    warm_up = 120
+    _, _, plain, _, _ = run()
+    _, _, averaged, _, _ = run(posterior="average")
+    np.testing.assert_array_equal(plain.seeds.real[:, :warm_up], averaged.seeds.real[:, :warm_up])
+    assert (plain.seeds.real[:, warm_up:240, 1] != averaged.seeds.real[:, warm_up:240, 1]).any()

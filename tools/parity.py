@@ -1,21 +1,25 @@
 """Compares every MJX port with its original simulator, as a table and as CSV.
 
-    python tools/parity.py [task ...] [states=2000] [episodes=30] [run_dir=RUN ...] > results/parity.csv
+    python tools/parity.py [task ...] [states=2000] [episodes=30] [run_dir=RUN ...] [output=results/parity.csv]
 
 For each task:
     step        one control step from the same simulator state and action: errors of observation and reward, and
-                agreement of `terminated`; states from random policies (fresh every step, and held for ten) and, where a
-                run directory of the task is given, from its trained policy
-    reset       the smallest p-value of two-sample Kolmogorov–Smirnov tests over the coordinates of initial states
+                agreement of `terminated`; states from random policies (fresh every step, and held for ten), from states
+                placed near every termination threshold, and from the trained policy of each run directory given.
+                `obs_*`: the largest error of a coordinate over the largest coordinate of the observation, or over 1
+                if that is less; `coordinate_p99`: the largest error in units of its coordinate's standard deviation
+    reset       two-sample Kolmogorov-Smirnov tests of every coordinate of initial states: the smallest p-value times
+                their number (Bonferroni), and which coordinate has it
     episodes    return and length of each policy's whole episodes on both backends, mean and standard error, and the
-                p-value of a two-sample Kolmogorov–Smirnov test of the returns
+                p-values of two-sample Kolmogorov-Smirnov tests
 """
 
 import csv
 import itertools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -27,8 +31,9 @@ from rich.console import Console
 from rich.table import Table
 
 from vecpsmbpo import envs, evaluate
-from vecpsmbpo.envs import registry
+from vecpsmbpo.envs import registry, termination
 from vecpsmbpo.envs.mjx.simulator import Physics
+from vecpsmbpo.settings import SettingError
 
 Policy = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]  # obs [..., O], t, key -> action [..., A]
 NEAR = 1e-4  # a state this close to a termination threshold may fall on either side in float32
@@ -65,11 +70,34 @@ def uniform(held: int, action_size: int) -> Policy:
     return act
 
 
-def collect(name: str, policy: Policy, states: int, seed: int) -> Step:
-    """Steps the original with `policy`."""
-    host, act = envs.make(name, "host", seed=seed), jax.jit(policy)
+# Indices into qpos and the values of them at which a task ends.
+THRESHOLDS = {
+    "ant": [(2, termination.ANT_MIN_HEIGHT), (2, termination.ANT_MAX_HEIGHT)],
+    "hopper": [(1, termination.HOPPER_MIN_HEIGHT)] + [(2, sign * termination.HOPPER_MAX_ANGLE) for sign in (-1, 1)],
+    "walker2d": [(1, termination.WALKER_MIN_HEIGHT), (1, termination.WALKER_MAX_HEIGHT)]
+    + [(2, sign * termination.WALKER_MAX_ANGLE) for sign in (-1, 1)],
+}
+AROUND = 0.02  # m or rad, how near to a threshold states are placed
+
+
+def place_near_threshold(host: Any, thresholds: list[tuple[int, float]], random: np.random.Generator) -> None:
+    """Puts the first simulator of a host environment where its next step may terminate."""
+    core = host.simulators[0].env.unwrapped
+    index, value = thresholds[random.integers(len(thresholds))]
+    qpos = np.array(core.data.qpos)
+    qpos[index] = value + random.uniform(-AROUND, AROUND)
+    core.set_state(qpos, np.array(core.data.qvel))
+
+
+def collect(name: str, policy: Policy, states: int, seed: int, *, near: bool = False) -> Step:
+    """Steps the original with `policy`; with `near`, every step from a state near a termination threshold."""
+    host, act, random = envs.make(name, "host", seed=seed), jax.jit(policy), np.random.default_rng(seed)
     obs, rows = host.reset()[0], []
     for t in range(states):
+        if near:
+            if t % 10 == 0:  # joints and velocities as they are early in an episode
+                obs = host.reset()[0]
+            place_near_threshold(host, THRESHOLDS[name], random)
         data = simulator_data(host)
         seen = np.array(data.qpos)
         if data.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
@@ -117,6 +145,8 @@ def compare_steps(port: Port, steps: Step) -> dict[str, float]:
     obs, reward, terminated = port.repeat(steps)
     scale = np.maximum(1.0, np.abs(steps.next_obs).max(axis=1))
     error = np.abs(obs - steps.next_obs).max(axis=1) / scale
+    deviation = steps.next_obs.std(axis=0)
+    by_coordinate = np.abs(obs - steps.next_obs) / np.where(deviation > 0, deviation, 1.0)
     reward_error = np.abs(reward - steps.reward) / np.maximum(1.0, np.abs(steps.reward))
     clear = ~near_threshold(port.env, steps.next_obs)
     return {
@@ -127,29 +157,32 @@ def compare_steps(port: Port, steps: Step) -> dict[str, float]:
         "obs_p50": float(np.median(error)),
         "obs_p99": float(np.quantile(error, 0.99)),
         "obs_max": float(error.max()),
+        "coordinate_p99": float(np.quantile(by_coordinate.max(axis=1), 0.99)),
         "reward_p99": float(np.quantile(reward_error, 0.99)),
         "reward_max": float(reward_error.max()),
         "terminated_agree": float(np.mean(terminated[clear] == steps.terminated[clear])),
     }
 
 
-def compare_resets(port: Port, name: str, count: int) -> float:
-    """The smallest p-value over coordinates; exact agreement of coordinates that do not vary counts as 1."""
+def compare_resets(port: Port, name: str, count: int) -> tuple[float, int]:
+    """The smallest p-value over the coordinates times their number, and the coordinate that has it. One that never
+    varies must be the same on both: 0 if it is not."""
     ours = np.asarray(port.reset(jax.random.split(jax.random.key(0), count)).obs)
     host = envs.make(name, "host", seed=1)
     theirs = np.concatenate([host.reset() for _ in range(count)])
-    smallest = 1.0
-    for column in range(ours.shape[1]):
-        if np.ptp(theirs[:, column]) > 0:
-            smallest = min(smallest, scipy.stats.ks_2samp(ours[:, column], theirs[:, column]).pvalue)
-        elif not np.allclose(ours[:, column], theirs[:, column], atol=1e-6):
-            return 0.0
-    return float(smallest)
+    values = []
+    for one, other in zip(ours.T, theirs.T, strict=True):
+        if np.ptp(other) > 0:
+            values.append(scipy.stats.ks_2samp(one, other).pvalue)
+        else:
+            values.append(float(np.allclose(one, other, atol=1e-6)))
+    worst = int(np.argmin(values))
+    return min(1.0, values[worst] * len(values)), worst
 
 
 def compare_episodes(port: Port, name: str, policy: Policy, count: int) -> dict[str, float]:
-    """`count` whole episodes of `policy` on each backend: mean and standard error of return and length, and the p-value
-    of a two-sample Kolmogorov–Smirnov test of the returns."""
+    """`count` whole episodes of `policy` on each backend: mean and standard error of return and length, and the
+    p-values of two-sample Kolmogorov-Smirnov tests of both."""
     env, limit, act = port.env, port.env.spec.episode_length, jax.jit(policy)
 
     def step(carry, t):
@@ -175,7 +208,10 @@ def compare_episodes(port: Port, name: str, policy: Policy, count: int) -> dict[
         news = host.step(np.asarray(act(obs, t, jax.random.key(4))))
         obs, total, length = news.obs, total + np.where(alive, news.reward, 0.0), length + alive
         alive &= ~(news.terminated | news.truncated)
-    found = {"return_p": float(scipy.stats.ks_2samp(ours[0], total).pvalue)}
+    found = {
+        f"{what}_p": float(scipy.stats.ks_2samp(mine, theirs).pvalue)
+        for what, mine, theirs in zip(("return", "length"), ours, (total, length), strict=True)
+    }
     for backend, values in (("mjx", ours), ("host", (total, length))):
         for what, value in zip(("return", "length"), values, strict=True):
             found[f"{what}_{backend}"] = float(value.mean())
@@ -189,34 +225,53 @@ def trained_policy(run_dir: str) -> tuple[str, Policy]:
     return settings.env, lambda obs, t, key: policy(obs)
 
 
-def main(arguments: list[str]) -> None:
+def rows_of(name: str, trained: dict[str, Policy], states: int, episodes: int) -> Iterator[dict[str, Any]]:
+    """The lines of the table about one task."""
+    port = Port(name)
+    size = port.env.action_size
+    policies = {"random": uniform(1, size), "held": uniform(10, size), **trained}
+    reset_p, worst = compare_resets(port, name, 3000)
+    shared = {"reset_p": reset_p, "reset_worst": worst}
+    for seed, (label, policy) in enumerate(policies.items()):
+        steps = compare_steps(port, collect(name, policy, states, seed))
+        yield {"task": name, "states_from": label, **steps, **shared, **compare_episodes(port, name, policy, episodes)}
+    if name in THRESHOLDS:
+        steps = compare_steps(port, collect(name, policies["random"], states, seed=99, near=True))
+        yield {"task": name, "states_from": "near termination", **steps}
+
+
+def main(arguments: list[str]) -> int:
     options = dict(text.split("=", 1) for text in arguments if "=" in text and not text.startswith("run_dir="))
     states, episodes = int(options.get("states", 2000)), int(options.get("episodes", 30))
-    trained = dict(trained_policy(text.split("=", 1)[1]) for text in arguments if text.startswith("run_dir="))
-    names = [text for text in arguments if "=" not in text] or registry.names("mjx")
+    output = Path(options.get("output", "results/parity.csv"))
+    try:
+        run_dirs = [text.removeprefix("run_dir=") for text in arguments if text.startswith("run_dir=")]
+        runs = [(Path(run_dir).name, *trained_policy(run_dir)) for run_dir in run_dirs]
+        names = [text for text in arguments if "=" not in text] or registry.names("mjx")
+        for name in names:
+            registry.resolve_backend(name, "mjx")
+    except SettingError as error:
+        print(f"parity.py: {error}", file=sys.stderr)
+        return 2
     rows: list[dict[str, Any]] = []
-    writer: Any = None
-    for name in names:
-        port = Port(name)
-        policies = {"random": uniform(1, port.env.action_size), "held": uniform(10, port.env.action_size)}
-        if name in trained:
-            policies["trained"] = trained[name]
-        reset_p = compare_resets(port, name, 1000)
-        for label, policy in policies.items():
-            steps = compare_steps(port, collect(name, policy, states, seed=len(rows)))
-            whole = compare_episodes(port, name, policy, episodes)
-            rows.append({"task": name, "policy": label, **steps, "reset_p": reset_p, **whole})
-            if writer is None:
-                writer = csv.DictWriter(sys.stdout, rows[0], lineterminator="\n")
-                writer.writeheader()
-            writer.writerow({k: f"{v:.3g}" if isinstance(v, float) else v for k, v in rows[-1].items()})
-            sys.stdout.flush()  # a long job that is cut short keeps what it has
+    with output.open("w") as file:
+        for name in names:
+            trained = {run_dir: policy for run_dir, task, policy in runs if task == name}
+            for row in rows_of(name, trained, states, episodes):
+                if not rows:
+                    writer = csv.DictWriter(file, row, lineterminator="\n", restval="")
+                    writer.writeheader()
+                rows.append(row)
+                writer.writerow({k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items()})
+                file.flush()  # a long job that is cut short keeps what it has
     shown = [column for column in rows[0] if not column.endswith("_se")]
     table = Table(*shown, title="MJX float32 against the original")
     for row in rows:
-        table.add_row(*(f"{row[k]:.2g}" if isinstance(row[k], float) else str(row[k]) for k in shown))
-    Console(stderr=True, width=200).print(table)
+        values = (row.get(column, "") for column in shown)
+        table.add_row(*(f"{value:.2g}" if isinstance(value, float) else str(value) for value in values))
+    Console(width=250).print(table)
+    return 0
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

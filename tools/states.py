@@ -1,14 +1,15 @@
-"""Draws the states that runs of one task have visited in a common plane (figures 8, 18 and 19).
+"""Lays the states that runs of one task have visited out in a common plane (figures 8, 18 and 19).
 
     python tools/states.py runs/x runs/y > states.csv
 
-One line per state: run, seed, env_steps (when it was visited), x, y (UMAP). The states are D_E of each run's
-newest checkpoint, thinned to `ROWS` per run and seed. Needs umap-learn: pip install 'vecpsmbpo[umap]'.
+One line per state: run, lane (seed and swept values), env_steps (when it was visited), x, y (UMAP). The states are D_E
+of each run's newest checkpoint, thinned to `ROWS` per run and lane. Needs umap-learn: pip install 'vecpsmbpo[umap]'.
 """
 
 import csv
 import importlib.util
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -19,8 +20,8 @@ from vecpsmbpo.settings import SettingError
 ROWS = 2000
 
 
-def visited(run_dir: str) -> list[tuple[str, int, int, np.ndarray]]:
-    """(run, seed, env_steps, observation [O]) of every state kept, oldest first."""
+def visited(run_dir: str) -> Iterator[tuple[str, str, int, np.ndarray]]:
+    """(run, seed and swept values, env_steps, observation [O]) of every state kept, oldest first."""
     settings = config.load(run_dir)
     runtime.configure(settings)
     driver, saved = restore(settings)
@@ -28,11 +29,9 @@ def visited(run_dir: str) -> list[tuple[str, int, int, np.ndarray]]:
     oldest = max(0, saved.step - rings.shape[1])
     steps = np.unique(np.linspace(oldest, saved.step - 1, ROWS).astype(int))
     size = driver.algorithm.spec.obs_size
-    return [
-        (run_dir, lane["seed"], int(step), ring[step % len(ring), :size])
-        for lane, ring in zip(settings.lanes, rings, strict=True)
-        for step in steps
-    ]
+    for lane, ring in zip(settings.lanes, rings, strict=True):
+        named = " ".join(f"{name}={value:g}" for name, value in lane.items())
+        yield from ((run_dir, named, int(step), ring[step % len(ring), :size]) for step in steps)
 
 
 def main(run_dirs: list[str]) -> int:
@@ -43,22 +42,22 @@ def main(run_dirs: list[str]) -> int:
         print("states.py: needs umap-learn; pip install 'vecpsmbpo[umap]'", file=sys.stderr)
         return 2
     try:
-        states = [state for run_dir in run_dirs for state in visited(run_dir)]
         tasks = {config.load(run_dir).task for run_dir in run_dirs}
         if len(tasks) > 1:
-            raise SettingError(f"states.py: all runs must be of one task, not of {', '.join(sorted(tasks))}")
+            raise SettingError(f"all runs must be of one task, not of {', '.join(sorted(tasks))}")
+        states = [state for run_dir in run_dirs for state in visited(run_dir)]
     except SettingError as error:
-        print(error, file=sys.stderr)
+        print(f"states.py: {error}", file=sys.stderr)
         return 2
     import umap
 
     obs = np.stack([obs for *_, obs in states])
     spread = obs.std(axis=0)
     plane = umap.UMAP(random_state=0).fit_transform((obs - obs.mean(axis=0)) / np.where(spread > 0, spread, 1.0))
-    writer = csv.writer(sys.stdout)
-    writer.writerow(["run", "seed", "env_steps", "x", "y"])
-    for (run, seed, step, _), (x, y) in zip(states, plane, strict=True):
-        writer.writerow([run, seed, step, f"{x:.4f}", f"{y:.4f}"])
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(["run", "lane", "env_steps", "x", "y"])
+    for (run, lane, step, _), (x, y) in zip(states, plane, strict=True):
+        writer.writerow([run, lane, step, f"{x:.4f}", f"{y:.4f}"])
     return 0
 
 

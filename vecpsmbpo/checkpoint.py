@@ -12,6 +12,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint import type_handlers
 
 from vecpsmbpo.layout import Layout
+from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import TrainState
 
 _log = logging.getLogger(__name__)
@@ -35,8 +36,15 @@ class Checkpoints:
     overwrite. Rings are not copied to be saved: orbax is handed views of them, and writes few of them at a time.
     """
 
-    def __init__(self, directory: Path):
-        options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, enable_async_checkpointing=False)
+    def __init__(self, directory: Path, *, read_only: bool = False):
+        self._directory = directory
+        self._damaged: list[int] = []
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=KEPT,
+            enable_async_checkpointing=False,
+            cleanup_tmp_directories=not read_only,  # of a save that was killed
+            read_only=read_only,
+        )
         for name in ("absl", "orbax"):
             logging.getLogger(name).setLevel(logging.ERROR)
         # Measured on 1 GiB of rings: orbax's defaults take 1.9 GiB beside them, these settings 0.1.
@@ -56,7 +64,12 @@ class Checkpoints:
         return sorted(self._manager.all_steps())
 
     def save(self, step: int, state: TrainState, host: dict[str, Any], layout: Layout) -> None:
-        """Saves the train state, and what the host knows beside it in JSON's types."""
+        """Saves the train state, and what the host knows beside it in JSON's types.
+
+        Checkpoints that `restore` found damaged make room first: the run has gone on from an older one.
+        """
+        while self._damaged:
+            self._manager.delete(self._damaged.pop())
         plain = _to_host(state, layout)
         chunks = jax.tree.map(lambda _: ocp.SaveArgs(chunk_byte_size=CHUNK_BYTES), plain)
         items = ocp.args.Composite(state=ocp.args.PyTreeSave(plain, save_args=chunks), host=ocp.args.JsonSave(host))
@@ -64,29 +77,39 @@ class Checkpoints:
         self._manager.wait_until_finished()
 
     def restore(self, shapes: TrainState, layout: Layout, warn: Callable[[str], None]) -> Saved | None:
-        """The newest checkpoint that can be read, laid out on the mesh; None where there is none.
+        """The newest checkpoint that can be read, laid out on the mesh; None where there is none at all.
 
-        Damaged ones are warned of and removed.
+        Damaged ones are warned of. Nothing is removed.
 
         Args:
             shapes: of the train state, as `jax.eval_shape` of its initialisation gives them.
+
+        Raises:
+            SettingError: there are checkpoints, and none can be read.
         """
-        plain = _shapes_on_host(shapes, layout)
-        as_array = jax.tree.map(lambda x: ocp.ArrayRestoreArgs(restore_type=np.ndarray), plain)
+        reason: Exception | None = None
         for step in reversed(self.steps()):
             try:
-                items = self._manager.restore(
-                    step,
-                    args=ocp.args.Composite(
-                        state=ocp.args.PyTreeRestore(plain, restore_args=as_array), host=ocp.args.JsonRestore()
-                    ),
-                )
-                return Saved(step, _from_host(items["state"], shapes, layout), items["host"])
+                items = self._read(step, shapes, layout)
+            except MemoryError:
+                raise
             except Exception as error:  # whatever a damaged file makes orbax raise
                 _log.debug("checkpoint %d", step, exc_info=error)
                 warn(f"the checkpoint at step {step} is damaged; taking the one before it")
-                self._manager.delete(step)
+                reason = error
+                self._damaged.append(step)
+            else:
+                return Saved(step, _from_host(items["state"], shapes, layout), items["host"])
+        if reason is not None:
+            what = (str(reason).strip() or repr(reason)).splitlines()[0][:200]
+            raise SettingError(f"{self._directory}: holds checkpoints, but none that can be read ({what})")
         return None
+
+    def _read(self, step: int, shapes: TrainState, layout: Layout) -> Any:
+        plain = _shapes_on_host(shapes, layout)
+        as_array = jax.tree.map(lambda x: ocp.ArrayRestoreArgs(restore_type=np.ndarray), plain)
+        state = ocp.args.PyTreeRestore(plain, restore_args=as_array)
+        return self._manager.restore(step, args=ocp.args.Composite(state=state, host=ocp.args.JsonRestore()))
 
     def close(self) -> None:
         self._manager.close()

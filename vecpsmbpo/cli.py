@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from vecpsmbpo.settings import SettingError
+from vecpsmbpo.settings import SettingError, Settings
 
 HELP = """\
 vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX and MJX
@@ -33,6 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SettingError as error:
         print(f"vecpsmbpo: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:  # before a run heeds signals itself, or a second one
+        print("vecpsmbpo: interrupted", file=sys.stderr)
+        return 130
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -64,7 +67,7 @@ def _train(overrides: list[str]) -> int:
     return _run(config.resolve(overrides))
 
 
-def _run(settings) -> int:
+def _run(settings: Settings) -> int:
     from vecpsmbpo.train import DiskError, Diverged, train
 
     try:
@@ -80,23 +83,35 @@ def _run(settings) -> int:
 
 
 def _multirun(overrides: list[str]) -> int:
-    """Hydra's own multirun, so that its sweepers and launchers work."""
+    """Hydra's own multirun, so that its sweepers and launchers work.
+
+    A run that cannot be made, or diverges, does not take the others with it; the exit status is the worst of all. A
+    signal stops them all.
+    """
     import hydra
 
     from vecpsmbpo import config
 
     config.parse(overrides, sweep=True)
 
+    worst = 0
+
     def task(tree) -> None:
         from hydra.core.hydra_config import HydraConfig
 
-        status = _run(config.resolve(list(HydraConfig.get().overrides.task), tree))
-        if status:
+        nonlocal worst
+        try:
+            status = _run(config.resolve(list(HydraConfig.get().overrides.task), tree))
+        except SettingError as error:
+            print(f"vecpsmbpo: {error}", file=sys.stderr)
+            status = 2
+        if status > 2:
             sys.exit(status)
+        worst = max(worst, status)
 
-    sys.argv = ["vecpsmbpo", "--multirun", *config.for_hydra(overrides)]
+    sys.argv = ["vecpsmbpo", *config.for_hydra(overrides), "hydra.mode=MULTIRUN"]
     hydra.main(version_base="1.3", config_path="pkg://vecpsmbpo.configs", config_name="config")(task)()
-    return 0
+    return worst
 
 
 def _eval(rest: list[str]) -> int:

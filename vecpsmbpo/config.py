@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from vecpsmbpo.envs import registry
-from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, build, check, check_sweep
+from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, Settings, allowed, build, check, check_sweep
 
 CONFIG_FILE = "config.yaml"
 GROUPS = ("env", "algo", "size")
@@ -92,9 +92,13 @@ def _check_env_options(found: dict[str, Any]) -> None:
             raise SettingError(f"{name}: no such option of env={env}; it has {has}")
 
 
+def _defaults() -> dict[str, Any]:
+    """What `configs/config.yaml` says."""
+    return yaml.safe_load((resources.files("vecpsmbpo.configs") / "config.yaml").read_text())
+
+
 def _default(group: str) -> str:
-    text = (resources.files("vecpsmbpo.configs") / "config.yaml").read_text()
-    return next(entry[group] for entry in yaml.safe_load(text)["defaults"] if group in entry)
+    return next(entry[group] for entry in _defaults()["defaults"] if group in entry)
 
 
 def _sweep_values(override: Override) -> list[Any]:
@@ -120,7 +124,7 @@ def _first_line(error: Exception) -> str:
     return str(error).strip().splitlines()[0]
 
 
-def compose(overrides: Sequence[str]):
+def compose(overrides: Sequence[str]) -> Settings:
     """The settings of a new run.
 
     Raises:
@@ -140,7 +144,7 @@ def for_hydra(overrides: Iterable[str]) -> list[str]:
     return [f"++{text}" if text.startswith("sweep.") else text for text in overrides]
 
 
-def from_tree(tree: DictConfig, overrides: Sequence[str]):
+def from_tree(tree: DictConfig, overrides: Sequence[str]) -> Settings:
     """Settings from what Hydra composed, with the backend and the run directory resolved."""
     values: Any = OmegaConf.to_container(tree, resolve=True)
     values["sweep"] = values["sweep"] or {}
@@ -157,7 +161,7 @@ def from_tree(tree: DictConfig, overrides: Sequence[str]):
     return settings
 
 
-def _default_run_dir(settings, overrides: Sequence[str]) -> str:
+def _default_run_dir(settings: Settings, overrides: Sequence[str]) -> str:
     """The same command gives the same directory, so that running it again goes on with the run."""
     extra = sorted(text for text in overrides if text.split("=")[0].lstrip("+") not in _UNNAMED)
     task = [str(value) for _, value in settings.env_options if any(text.startswith("env.") for text in extra)]
@@ -169,17 +173,18 @@ def _default_run_dir(settings, overrides: Sequence[str]) -> str:
     return str(Path("runs", *experiment) / "-".join(parts))
 
 
-def save(settings, run_dir: Path) -> None:
+def save(settings: Settings, run_dir: Path) -> None:
     """Writes `config.yaml`."""
     values: dict[str, Any] = dataclasses.asdict(settings)
     values["env_options"] = dict(settings.env_options)
     values["sweep"] = {name: list(swept) for name, swept in settings.sweep}
     values["real_ratio_arms"] = list(settings.real_ratio_arms)
-    text = yaml.safe_dump(values, sort_keys=False)
-    (run_dir / CONFIG_FILE).write_text(text)
+    beside = run_dir / f"{CONFIG_FILE}.tmp"
+    beside.write_text(yaml.safe_dump(values, sort_keys=False))
+    beside.replace(run_dir / CONFIG_FILE)  # at once: a run whose config is cut short could not be resumed
 
 
-def load(run_dir: str | Path):
+def load(run_dir: str | Path) -> Settings:
     """The settings that a run directory was started with.
 
     Raises:
@@ -187,15 +192,16 @@ def load(run_dir: str | Path):
     """
     path = Path(run_dir) / CONFIG_FILE
     try:
-        values = yaml.safe_load(path.read_text())
-        return dataclasses.replace(build(values), run_dir=str(run_dir))
+        stored = yaml.safe_load(path.read_text())
+        # What the run does not know came to this program after it, and is off by default.
+        return dataclasses.replace(build({**_defaults(), **stored}), run_dir=str(run_dir))
     except OSError:
         raise SettingError(f"run_dir={run_dir}: holds no {CONFIG_FILE}, so no run") from None
     except (KeyError, TypeError, yaml.YAMLError) as error:
         raise SettingError(f"run_dir={run_dir}: its {CONFIG_FILE} cannot be read ({error})") from None
 
 
-def resolve(overrides: Sequence[str], tree: DictConfig | None = None):
+def resolve(overrides: Sequence[str], tree: DictConfig | None = None) -> Settings:
     """The settings of a run, new or resumed: a `run_dir` that holds one resumes with its own.
 
     Args:
@@ -207,7 +213,7 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None):
     """
     given = parse(overrides, sweep=tree is not None)
 
-    def new():
+    def new() -> Settings:
         return compose(overrides) if tree is None else from_tree(tree, overrides)
 
     run_dir = given.get("run_dir") or new().run_dir
@@ -216,6 +222,8 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None):
     stored = load(run_dir)
     changed = {}
     for name, value in given.items():
+        if name == "experiment":  # a name for a grid; what it sets has been given beside it
+            continue
         group, _, option = name.rpartition(".")
         had = dict(getattr(stored, _DOTTED[group])).get(option) if group else getattr(stored, name)
         if name == "run_dir" or value == had or (name, value) == ("backend", "auto"):
@@ -239,7 +247,7 @@ EVALUATION = {
 }
 
 
-def resolve_evaluation(overrides: Sequence[str]):
+def resolve_evaluation(overrides: Sequence[str]) -> tuple[Settings, Settings]:
     """Settings of the run in `run_dir=`, as stored and as they are to be evaluated.
 
     Raises:
@@ -254,6 +262,12 @@ def resolve_evaluation(overrides: Sequence[str]):
     if "run_dir" not in given:
         raise SettingError("run_dir: eval needs run_dir=…, a directory that train has written")
     stored = load(given.pop("run_dir"))
-    changes = {EVALUATION[name]: check(EVALUATION[name], value) for name, value in given.items()}
+    changes = {}
+    for name, value in given.items():
+        setting = EVALUATION[name]
+        try:
+            changes[setting] = check(setting, value)
+        except SettingError:
+            raise SettingError(f"{name}={value}: must be {allowed(setting)}") from None
     changes["backend"] = registry.resolve_backend(stored.env, changes.get("backend", stored.backend))
     return stored, dataclasses.replace(stored, **changes)

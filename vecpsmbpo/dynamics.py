@@ -161,7 +161,8 @@ def loss(model: Model, batch: Transition, *, net: networks.GaussianMLP) -> jax.A
 def validation_error(
     model: Model, rows_of: Callable[[jax.Array], Transition], split: Split, block: int, *, net: networks.GaussianMLP
 ) -> jax.Array:
-    """Mean squared error over the validation rows, [], in units of the model's outputs, in batches of a fixed size.
+    """Mean squared error over the validation rows, [], in units of the model's outputs, in batches of a fixed size;
+    where termination is learned, plus its cross-entropy.
 
     Args:
         rows_of: indices [B] -> the rows of D_E, leaves [B, ...].
@@ -170,9 +171,11 @@ def validation_error(
     def add_batch(index, total):
         rows, exists = split.validation_rows(index * VALIDATION_BATCH, VALIDATION_BATCH, block)
         batch = rows_of(rows)
-        mean = forward(model, batch.obs, batch.action, net=net).mean
-        error = (mean - _targets(batch)) / model.scaling.output_std
-        return total + jnp.sum(jnp.where(exists, jnp.mean(error**2, axis=-1), 0.0))
+        prediction = forward(model, batch.obs, batch.action, net=net)
+        error = jnp.mean(((prediction.mean - _targets(batch)) / model.scaling.output_std) ** 2, axis=-1)
+        if prediction.logit is not None:
+            error += optax.sigmoid_binary_cross_entropy(prediction.logit, batch.terminated)
+        return total + jnp.sum(jnp.where(exists, error, 0.0))
 
     batches = -(-split.blocks // VALIDATION_BATCH)
     return jax.lax.fori_loop(0, batches, add_batch, 0.0) / jnp.maximum(split.blocks, 1)

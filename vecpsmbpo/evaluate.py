@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from vecpsmbpo import checkpoint, config, runtime
+from vecpsmbpo import checkpoint, config, resources, runtime
 from vecpsmbpo.drivers import Driver
 from vecpsmbpo.drivers.common import evaluation_policies
 from vecpsmbpo.settings import SettingError, Settings
@@ -27,6 +27,7 @@ def evaluate(stored: Settings, settings: Settings) -> int:
         SettingError: the run holds no checkpoint.
     """
     runtime.configure(settings)
+    stored = replace(stored, devices=settings.devices)
     trained, saved = restore(stored)
     driver = trained if settings == stored else make_driver(settings)
     returns = driver.evaluate(saved.state, evaluation_keys(settings, saved.step), settings.eval_episodes)
@@ -46,11 +47,12 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
     """The driver of a run and its newest checkpoint.
 
     Raises:
-        SettingError: the run holds no checkpoint.
+        SettingError: the run holds no checkpoint, or there is not enough memory for it.
     """
     driver = make_driver(stored)
-    shapes = jax.eval_shape(driver.init, *initial_inputs(stored))
-    checkpoints = checkpoint.Checkpoints(Path(stored.run_dir) / "checkpoints")
+    shapes = driver.shapes(*initial_inputs(stored))
+    resources.check_memory(stored, driver.algorithm.spec, driver.layout, shapes)
+    checkpoints = checkpoint.Checkpoints(Path(stored.run_dir) / "checkpoints", read_only=True)
     saved = checkpoints.restore(shapes, driver.layout, warn=lambda text: Console(stderr=True).print(text))
     checkpoints.close()
     if saved is None:

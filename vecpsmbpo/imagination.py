@@ -14,9 +14,18 @@ LARGEST_CHUNK = 4096  # rows of one member in flight: enough to fill the machine
 
 
 def chunk_size(settings: Settings) -> int:
-    """Start states rolled out together: the largest divisor of `rollout_starts` up to `LARGEST_CHUNK`."""
-    starts = min(settings.rollout_starts, settings.imagined_capacity)
-    return max(size for size in range(1, min(starts, LARGEST_CHUNK) + 1) if starts % size == 0)
+    """Start states rolled out together: an even part of `rollout_starts`, and at most as many as the ring can hold the
+    longest rollouts of."""
+    starts = settings.rollout_starts
+    most = max(min(LARGEST_CHUNK, settings.imagined_capacity // longest_horizon(settings)), 1)
+    fewest = -(-starts // most)
+    # Parts that leave no rest, if there are some nearly as large; else a few starts less.
+    parts = next((count for count in range(fewest, 2 * fewest + 1) if starts % count == 0), fewest)
+    return starts // parts
+
+
+def longest_horizon(settings: Settings) -> int:
+    return max(settings.horizon_first, settings.horizon_last)
 
 
 def ring_capacity(settings: Settings) -> int:
@@ -25,8 +34,7 @@ def ring_capacity(settings: Settings) -> int:
     A multiple of the chunk, so that a block of rows never wraps. At a shorter horizon it would hold many epochs: see
     `retained_rows`.
     """
-    horizon = max(settings.horizon_first, settings.horizon_last)
-    wanted = settings.rollout_starts * horizon * settings.refreshes_per_epoch
+    wanted = settings.rollout_starts * longest_horizon(settings) * settings.refreshes_per_epoch
     chunk = chunk_size(settings)
     return max(min(wanted, settings.imagined_capacity) // chunk, 1) * chunk
 
@@ -34,12 +42,12 @@ def ring_capacity(settings: Settings) -> int:
 def horizon(settings: Settings, env_steps: jax.Array) -> jax.Array:
     """Table 1's schedule x → y over epochs a → b: ⌊clip(x + (k - a) / (b - a) · (y - x))⌋.
 
-    k counts epochs of 1000 environment steps, whatever `epoch_steps` is.
+    k counts whole epochs of 1000 environment steps, whatever `epoch_steps` is.
     """
     first, last = settings.horizon_first, settings.horizon_last
     start, end = settings.horizon_ramp_start, settings.horizon_ramp_end
     # The small addend keeps an exact corner, such as k = b, from being floored away by float32 rounding.
-    value = first + (env_steps / 1000 - start) / (end - start) * (last - first) + 1e-4
+    value = first + (env_steps // 1000 - start) / (end - start) * (last - first) + 1e-4
     return jnp.floor(jnp.clip(value, min(first, last), max(first, last))).astype(jnp.int32)
 
 

@@ -49,11 +49,11 @@ class Layout:
 
     @classmethod
     def of(cls, settings: Settings) -> "Layout":
-        """Uses every device of the process that can be given work, or the first `settings.devices` of them."""
+        """Uses the devices of the process that can be given work, of the first `settings.devices`."""
         devices = jax.devices()
-        count = min(settings.devices or len(devices), len(devices), settings.parallel_parts)
-        over_seeds = math.gcd(len(settings.lanes), count)
-        grid = np.array(devices[:count]).reshape(over_seeds, count // over_seeds)
+        most = min(settings.devices or len(devices), len(devices))
+        shape = _mesh_shape(len(settings.lanes), max(settings.n_members, settings.n_models), most)
+        grid = np.array(devices[: math.prod(shape)]).reshape(shape)
         return cls(
             mesh=Mesh(grid, (SEEDS, MEMBERS)),
             num_seeds=len(settings.lanes),
@@ -244,6 +244,18 @@ class Layout:
             part = part.reshape(sharding.shard_shape(like.shape))
             parts += [jax.device_put(part, device) for device in devices]
         return jax.make_array_from_single_device_arrays(like.shape, sharding, parts)
+
+
+def _mesh_shape(lanes: int, parts: int, most: int) -> tuple[int, int]:
+    """Devices over seeds and over members, up to `most` together: such that the busiest has least to do, and no more of
+    them than that takes.
+
+    Args:
+        lanes: S, which the devices over seeds must divide.
+        parts: what each of them has that members or models can be spread over; padded, where it does not divide.
+    """
+    shapes = [(s, m) for s in range(1, most + 1) if lanes % s == 0 for m in range(1, most // s + 1)]
+    return min(shapes, key=lambda shape: (lanes // shape[0] * -(-parts // shape[1]), math.prod(shape), shape[1]))
 
 
 def _view(x: Any) -> np.ndarray:

@@ -95,7 +95,7 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
         terminated = bool(news.terminated[step, seed])
         lines.append(
             {
-                **settings.lanes[seed],
+                **_lane(settings, seed),
                 "episode": int(index),
                 "env_steps": env_steps + int(step) + 1,
                 "model": None if member < 0 else int(member) // settings.n_policies,
@@ -125,7 +125,7 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
         seeds.hyper, seeds.bandit
     )
     lines = []
-    for seed, lane in enumerate(settings.lanes):
+    for seed in range(len(settings.lanes)):
         episodes = float(seeds.epoch_episodes[seed])
         models = {
             "model_loss": seeds.models.loss[seed, : settings.n_models],
@@ -136,13 +136,13 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
         lines.append(
             {
                 "env_steps": env_steps,
-                **lane,
+                **_lane(settings, seed),
                 "train_return": float(seeds.epoch_return[seed]) / episodes if episodes else None,
                 "train_episodes": int(episodes),
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
-                "real_ratio": _setting(ratios[seed]),
-                "temperature": _setting(seeds.hyper.temperature[seed]),
+                "real_ratio": _number(ratios[seed]),
+                "temperature": _number(seeds.hyper.temperature[seed]),
             }
         )
         if seeds.bandit is not None:
@@ -151,6 +151,13 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     return lines
 
 
-def _setting(value: jax.Array) -> float | None:
-    """A float32 as it was set: 0.2 and not 0.20000000298. None for infinity, which JSON does not have."""
-    return float(str(np.float32(value))) if np.isfinite(value) else None
+def _lane(settings: Settings, index: int) -> Line:
+    """The seed and the swept values of a lane, by name."""
+    return {name: _number(value) for name, value in settings.lanes[index].items()}
+
+
+def _number(value: Any) -> int | float | str:
+    """A number as it was set: 0.2 and not float32's 0.20000000298; "inf" for infinity, which JSON does not have."""
+    if isinstance(value, int):
+        return value
+    return float(str(np.float32(value))) if np.isfinite(value) else "inf"

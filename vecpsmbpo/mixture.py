@@ -12,15 +12,17 @@ from vecpsmbpo.types import Bandit, Hyper
 def real_ratio(settings: Settings, hyper: Hyper, bandit: Bandit | None, env_steps: jax.Array) -> jax.Array:
     """λ now, []."""
     if settings.real_ratio_schedule == "linear":
-        return linear(hyper.real_ratio, env_steps / settings.total_steps)
+        # Of the steps that learn, so that as many real rows are used as with the constant.
+        learning = max(settings.total_steps - settings.first_learning_step, 1)
+        return linear(hyper.real_ratio, jnp.maximum(env_steps - settings.first_learning_step, 0) / learning)
     if bandit is not None:
         return jnp.asarray(settings.real_ratio_arms)[bandit.arm]
     return hyper.real_ratio
 
 
 def linear(mean: jax.Array, progress: jax.Array) -> jax.Array:
-    """λ after a share `progress` of the run, on a line from 1 to 0 under which lies the same area as under the constant
-    `mean` (figure 13).
+    """λ after a share `progress` of the learning, on a line from 1 to 0 under which lies the same area as under the
+    constant `mean` (figure 13).
 
     Up to a mean of 1/2 the line begins at once, reaches 0 at 2 · mean, and stays there; for a larger mean it begins so
     much later that it reaches 0 at the end.
@@ -40,22 +42,28 @@ def linear(mean: jax.Array, progress: jax.Array) -> jax.Array:
 # regret against the best sequence of arms with few changes: no weight ever falls so low that its arm could not return.
 
 
+HARDNESS = 2  # 1 + the number of changes of the best arm that are reckoned with
+MOST_EXPLORED = 0.5
+
+
 def init(settings: Settings, key: jax.Array) -> Bandit:
     """Equal weights, and a first arm."""
     count = len(settings.real_ratio_arms)
     nothing = jnp.zeros(())
-    return Bandit(jnp.zeros(count), jax.random.randint(key, (), 0, count), jnp.bool_(False), nothing, nothing, nothing)
+    return Bandit(jnp.zeros(count), jax.random.randint(key, (), 0, count), jnp.int32(0), nothing, nothing, nothing)
 
 
 def rates(settings: Settings) -> tuple[float, float]:
-    """γ, how much is explored, and α, how much weight is shared: those of corollary 8.2 for one change of arms.
+    """γ, how much is explored, and α, how much weight is shared: those that bound the regret against the best sequence
+    with one change of arms (hardness S = 2).
 
-    Below some 50 rounds that γ nears 1, at which no gain would count (and the corollary promises nothing). So short
+    Below some hundred rounds that γ nears 1, at which no gain would count (and the bound promises nothing). So short
     runs explore half of the time.
     """
-    arms, rounds = len(settings.real_ratio_arms), max(settings.total_steps // settings.epoch_steps, 1)
-    explored = math.sqrt(arms * (math.log(arms * rounds) + math.e) / ((math.e - 1) * rounds))
-    return min(0.5, explored), 1 / rounds
+    arms, learning = len(settings.real_ratio_arms), settings.total_steps - settings.first_learning_step
+    rounds = max(learning // settings.epoch_steps, 1)
+    explored = math.sqrt(arms * (HARDNESS * math.log(arms * rounds) + math.e) / ((math.e - 1) * rounds))
+    return min(MOST_EXPLORED, explored), 1 / rounds
 
 
 def probabilities(bandit: Bandit, settings: Settings) -> jax.Array:
@@ -68,15 +76,16 @@ def end_round(bandit: Bandit, settings: Settings, episode_return: jax.Array, key
     """Rewards the arm in force with the epoch's mean return, and draws the next one.
 
     The gain lies in [0, 1]: 1/2 plus half the change since the epoch before, in units of the range of all epochs' mean
-    returns so far. The first epoch has nothing to be compared with.
+    returns so far. The first epoch has nothing to be compared with, and the second no scale: its change is the range.
     """
-    lowest = jnp.where(bandit.compares, jnp.minimum(bandit.lowest, episode_return), episode_return)
-    highest = jnp.where(bandit.compares, jnp.maximum(bandit.highest, episode_return), episode_return)
+    first = bandit.rounds == 0
+    lowest = jnp.where(first, episode_return, jnp.minimum(bandit.lowest, episode_return))
+    highest = jnp.where(first, episode_return, jnp.maximum(bandit.highest, episode_return))
     change = (episode_return - bandit.previous) / jnp.maximum(highest - lowest, 1e-6)
     weights = reinforce(bandit, settings, 0.5 + 0.5 * jnp.clip(change, -1.0, 1.0))
     bandit = bandit.replace(
-        log_weights=jnp.where(bandit.compares, weights, bandit.log_weights),
-        compares=jnp.bool_(True),
+        log_weights=jnp.where(bandit.rounds >= 2, weights, bandit.log_weights),
+        rounds=bandit.rounds + 1,
         previous=episode_return,
         lowest=lowest,
         highest=highest,

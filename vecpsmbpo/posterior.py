@@ -28,6 +28,11 @@ def logits(posterior: Posterior, temperature: jax.Array) -> jax.Array:
     return (centred - posterior.compensation) / temperature
 
 
+def best(posterior: Posterior) -> jax.Array:
+    """The member that has earned the most, [] int, whatever the temperature."""
+    return jnp.argmax(logits(posterior, jnp.float32(1.0)))
+
+
 def draw(posterior: Posterior, temperature: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """A member, [] int, and the distribution [N·M] that it was drawn from."""
     scores = logits(posterior, temperature)

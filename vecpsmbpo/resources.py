@@ -65,12 +65,15 @@ def _machine_available() -> int:
 
 
 def _control_group_available() -> int:
+    group = Path("/sys/fs/cgroup")
     try:
-        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
+        limit = (group / "memory.max").read_text().strip()
+        used = int((group / "memory.current").read_text())
+        stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
     except OSError:
         return 2**63
-    return 2**63 if limit == "max" else int(limit) - used
+    # What files are cached counts as used, and is given up when it is needed.
+    return 2**63 if limit == "max" else int(limit) - used + int(stat.get("inactive_file", 0))
 
 
 def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any) -> str:
@@ -93,8 +96,8 @@ def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any)
     return f"{words}, of {free / GIB:.1f} GiB free"
 
 
-def check_disk(directory: Path, state: TrainState) -> None:
-    """Whether there is room for a checkpoint: parameters whole, buffers as far as they are filled.
+def check_disk(directory: Path, state: TrainState, env_steps: int) -> None:
+    """Whether there is room for a checkpoint at `env_steps`: parameters whole, buffers as far as they are filled then.
 
     Asked before writing, since orbax's threads report a disk that fills under them in a page of tracebacks.
 
@@ -102,12 +105,13 @@ def check_disk(directory: Path, state: TrainState) -> None:
         OSError: ENOSPC.
     """
 
-    def filled(ring: jax.Array, added: jax.Array) -> int:
-        return ring.nbytes * min(int(added), ring.shape[-2]) // ring.shape[-2]
+    def filled(ring: jax.Array, rows: int) -> int:
+        return ring.nbytes * min(rows, ring.shape[-2]) // ring.shape[-2]
 
     seeds, counters = state.seeds, state.counters
-    needed = CHECKPOINT_OVERHEAD + filled(seeds.real, counters.env_steps)
-    needed += filled(seeds.imagined, counters.imagined_rows)
+    later = env_steps > int(counters.env_steps)
+    imagined = seeds.imagined.shape[-2] if later else int(counters.imagined_rows)
+    needed = CHECKPOINT_OVERHEAD + filled(seeds.real, env_steps) + filled(seeds.imagined, imagined)
     needed += sum(leaf.nbytes for leaf in jax.tree.leaves((seeds.models, seeds.agents)))
     if shutil.disk_usage(directory).free < needed:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -12,21 +12,21 @@ SINGLE_THREADED = "--xla_cpu_multi_thread_eigen=false"
 
 
 def configure(settings: Settings) -> None:
-    """One CPU device per core that can be given work, and the compilation cache.
+    """One CPU device per core, and the compilation cache.
 
-    Each CPU device then computes on one thread: members spread over devices use the cores better than threads inside
-    small matrix products do, and results do not depend on the scheduling of threads. JAX ignores the CPU settings
-    where there is a GPU.
+    Each CPU device computes on one thread: members spread over devices use the cores better than threads inside small
+    matrix products do, and results do not depend on the scheduling of threads. How many of them a run uses is decided
+    by `layout`: the jobs of a multirun share a process, and differ in that. JAX ignores the CPU settings where there is
+    a GPU.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    useful = min(settings.devices or cores, cores, settings.parallel_parts)
     flags = os.environ.get("XLA_FLAGS", "")
-    if useful > 1 and "xla_cpu_multi_thread_eigen" not in flags:
+    if "xla_cpu_multi_thread_eigen" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {SINGLE_THREADED}".strip()
     if "xla_force_host_platform_device_count" not in flags:
         try:
-            jax.config.update("jax_num_cpu_devices", useful)
-        except RuntimeError:  # a backend is there already: a program that imports this package set it up its own way
+            jax.config.update("jax_num_cpu_devices", cores)
+        except RuntimeError:  # a backend is there already: an earlier job's, or of a program that imports this package
             logging.getLogger(__name__).debug("JAX is already initialised; its devices are used as they are")
     if settings.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(cache_dir()))

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 Range = tuple[float | None, float | None]
@@ -136,9 +136,9 @@ class Settings:
         return self.algo == "pets"
 
     @property
-    def parallel_parts(self) -> int:
-        """How many of the run's parts can be spread over devices: its members or its models, whichever are more."""
-        return len(self.lanes) * max(self.n_members, self.n_models)
+    def only_real(self) -> bool:
+        """Whether nothing is ever imagined: `algo=sac`."""
+        return self.algo == "sac"
 
     @functools.cached_property
     def lanes(self) -> tuple[dict[str, Any], ...]:
@@ -157,6 +157,12 @@ class Settings:
     def adapts_real_ratio(self) -> bool:
         """Whether λ is chosen online."""
         return self.real_ratio_schedule == "bandit"
+
+    @property
+    def imagines(self) -> bool:
+        """Whether any lane ever learns from imagined data (λ < 1)."""
+        ratios = dict(self.sweep).get("real_ratio", (self.real_ratio,))
+        return self.real_ratio_schedule != "constant" or min(ratios) < 1
 
     @property
     def refreshes_per_epoch(self) -> int:
@@ -283,28 +289,63 @@ def build(values: Mapping[str, Any]) -> Settings:
     sweep = tuple((name, check_sweep(name, swept)) for name, swept in sorted(dict(values.get("sweep", ())).items()))
     checked = {name: check(name, values[name]) for name in FIELDS}
     settings = Settings(env_options=options, sweep=sweep, **checked)
-    if settings.epoch_steps % settings.model_update_every:
-        raise SettingError(
-            f"model_update_every={settings.model_update_every}: must divide epoch_steps={settings.epoch_steps}"
-        )
-    if settings.total_steps % settings.epoch_steps:
-        raise SettingError(
-            f"total_steps={settings.total_steps}: must be a multiple of epoch_steps={settings.epoch_steps}"
-        )
-    if settings.horizon_ramp_end <= settings.horizon_ramp_start:
-        raise SettingError("horizon_ramp_end: must be greater than horizon_ramp_start")
-    if settings.warmup_steps < settings.validation_block:
-        raise SettingError(
-            f"warmup_steps={settings.warmup_steps}: must be at least 1 / validation_ratio = {settings.validation_block}"
-        )
-    if settings.alternates and (settings.n_models, settings.n_policies) != (1, 1):
-        raise SettingError("n_models, n_policies: must be 1 with algo=slbo, which has one model and one policy")
-    if settings.plan_elites > settings.plan_population:
-        raise SettingError(f"plan_elites={settings.plan_elites}: must be at most plan_population")
-    if settings.plans and settings.plan_particles % settings.n_models:
-        raise SettingError(
-            f"plan_particles={settings.plan_particles}: must be a multiple of n_models={settings.n_models}"
-        )
-    if settings.replay_capacity < settings.warmup_steps:
-        raise SettingError(f"replay_capacity={settings.replay_capacity}: must be at least warmup_steps")
+    for wrong, complaint in _contradictions(settings):
+        if wrong:
+            raise SettingError(complaint)
     return settings
+
+
+def _contradictions(settings: Settings) -> Iterator[tuple[bool, str]]:
+    """Whether settings contradict one another, and how to say so."""
+    one = settings
+    yield (
+        one.epoch_steps % one.model_update_every != 0,
+        f"model_update_every={one.model_update_every}: must divide epoch_steps={one.epoch_steps}",
+    )
+    yield (
+        one.total_steps % one.epoch_steps != 0,
+        f"total_steps={one.total_steps}: must be a multiple of epoch_steps={one.epoch_steps}",
+    )
+    yield (
+        one.seed + one.num_seeds > 2**31,
+        f"num_seeds={one.num_seeds}: the last seed, seed + num_seeds - 1, must be at most {2**31 - 1}",
+    )
+    yield one.horizon_ramp_end <= one.horizon_ramp_start, "horizon_ramp_end: must be greater than horizon_ramp_start"
+    yield (
+        not math.isclose(one.validation_block * one.validation_ratio, 1, rel_tol=1e-2),
+        f"validation_ratio={one.validation_ratio}: must be 1 / k for a whole number k, as one row in k validates",
+    )
+    yield (
+        one.warmup_steps < one.validation_block,
+        f"warmup_steps={one.warmup_steps}: must be at least 1 / validation_ratio = {one.validation_block}",
+    )
+    yield (
+        one.replay_capacity < one.warmup_steps,
+        f"replay_capacity={one.replay_capacity}: must be at least warmup_steps",
+    )
+    moves = one.real_ratio_schedule != "constant"
+    swept = dict(one.sweep)
+    yield moves and "real_ratio" in swept, "sweep.real_ratio: needs real_ratio_schedule=constant"
+    # What an algorithm does not have.
+    name, rolls_out = f"algo={one.algo}", not (one.only_real or one.alternates or one.plans)
+    longest = max(one.horizon_first, one.horizon_last)
+    yield (
+        rolls_out and one.imagined_capacity < longest,
+        f"imagined_capacity={one.imagined_capacity}: must hold a rollout, of up to {longest} steps",
+    )
+    yield (one.only_real or one.alternates) and one.n_models != 1, f"n_models={one.n_models}: must be 1 with {name}"
+    yield not rolls_out and one.n_policies != 1, f"n_policies={one.n_policies}: must be 1 with {name}"
+    ratio = 1.0 if one.only_real else 0.0
+    yield (
+        not rolls_out and (moves or "real_ratio" in swept or one.real_ratio != ratio),
+        f"real_ratio: must be {ratio:g} with {name}, and stay there",
+    )
+    yield (
+        (one.alternates or one.plans) and one.posterior == "average",
+        f"posterior=average: there are no policies to average with {name}",
+    )
+    yield one.plan_elites > one.plan_population, f"plan_elites={one.plan_elites}: must be at most plan_population"
+    yield (
+        one.plans and one.plan_particles % one.n_models != 0,
+        f"plan_particles={one.plan_particles}: must be a multiple of n_models={one.n_models}",
+    )

@@ -2,7 +2,9 @@
 
 import dataclasses
 import errno
+import fcntl
 import os
+import shlex
 import signal
 import sys
 import time
@@ -19,11 +21,18 @@ import numpy as np
 from vecpsmbpo import algorithms, checkpoint, config, envs, metrics, resources, runtime
 from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
 from vecpsmbpo.progress import Display, Rates, Stopwatch
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.types import Hyper, TrainState
 
 # An epoch that takes longer than this is run in chunks of about half of it, to show progress and to heed signals.
 LONG_EPOCH_S = 20.0
+
+
+# What the operating system says where a file cannot be written.
+DISK_ERRORS = frozenset(
+    {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
+    | {errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG}
+)
 
 
 class DiskError(Exception):
@@ -76,13 +85,13 @@ def train(settings: Settings) -> int:
     """
     runtime.configure(settings)
     driver = make_driver(settings)
-    shapes = jax.eval_shape(driver.init, *initial_inputs(settings))
+    shapes = driver.shapes(*initial_inputs(settings))
     memory = resources.check_memory(settings, driver.algorithm.spec, driver.layout, shapes)
     run_dir = Path(settings.run_dir)
     with _disk_errors(run_dir):
         run_dir.mkdir(parents=True, exist_ok=True)
-        config.save(settings, run_dir)
-        with _heeding_signals() as stop:
+        with _alone_in(run_dir), _heeding_signals() as stop:
+            config.save(settings, run_dir)
             return _Run(settings, driver, shapes, memory).go(stop)
 
 
@@ -115,8 +124,10 @@ class _Run:
                 if self.env_steps >= settings.total_steps:
                     self.display.say(f"already complete at {self.env_steps} steps; raise total_steps to go on")
                     return 0
+                # At once, and not after hours.
+                resources.check_disk(self.run_dir, self.state, settings.total_steps)
                 if self.saved_step is None:
-                    self._save()  # also shows at once, and not after hours, that there is room on the disk
+                    self._save()
                 self._compile()
                 while self.env_steps < settings.total_steps and not stop.requested:
                     self._chunk()
@@ -140,7 +151,8 @@ class _Run:
         self.display.say(f"run directory: {self.run_dir} ({where})")
 
     def _compile(self) -> None:
-        self.display.say("compiling the training program; the compilation cache makes this short next time …")
+        cached = "; the compilation cache makes this short next time" if self.settings.compile_cache else ""
+        self.display.say(f"compiling the training program{cached} …")
         self.driver.compile(self.state)
         self.display.say(f"compiled in {self.driver.compile_seconds:.1f} s")
 
@@ -206,7 +218,7 @@ class _Run:
 
     def _save(self) -> None:
         if self.saved_step != self.env_steps:
-            resources.check_disk(self.run_dir, self.state)
+            resources.check_disk(self.run_dir, self.state, self.env_steps)
             host = {"env": self.driver.save_env(), "seconds": self.watch()}
             self.checkpoints.save(self.env_steps, self.state, host, self.driver.layout)
             self.saved_step = self.env_steps
@@ -214,23 +226,29 @@ class _Run:
     def _farewell(self, stop: "_Stop") -> int:
         self.display.say(f"saved at step {self.env_steps} of {self.settings.total_steps}: {self.run_dir}")
         if self.env_steps < self.settings.total_steps:
-            self.display.say(f"to continue: vecpsmbpo train run_dir={self.run_dir}")
+            self.display.say(f"to continue: vecpsmbpo train {shlex.quote(f'run_dir={self.run_dir}')}")
             return 128 + (stop.requested or 0)
-        self.display.say(f"to evaluate: vecpsmbpo eval run_dir={self.run_dir} episodes=10")
+        self.display.say(f"to evaluate: vecpsmbpo eval {shlex.quote(f'run_dir={self.run_dir}')} episodes=10")
         return 0
 
     def _check_finite(self, before: int) -> None:
-        seeds = self.state.seeds
-        for kind, tree in (("agents", seeds.agents), ("models", seeds.models)):
+        seeds, settings = self.state.seeds, self.settings
+        for kind, tree, count in (
+            ("agents", seeds.agents, settings.n_members),
+            ("models", seeds.models, settings.n_models),
+        ):
             if bool(_all_finite(tree)):
+                continue
+            tree = jax.tree.map(lambda x, count=count: x[:, :count], tree)
+            if bool(_all_finite(tree)):  # only those that fill the mesh
                 continue
             what, seed, index = _first_not_finite(tree, kind)
             member = (
                 f"model n = {index}"
                 if kind == "models"
-                else f"policy n = {index // self.settings.n_policies}, m = {index % self.settings.n_policies}"
+                else f"policy n = {index // settings.n_policies}, m = {index % settings.n_policies}"
             )
-            lane = ", ".join(f"{name} {value:g}" for name, value in self.settings.lanes[seed].items())
+            lane = ", ".join(f"{name} {value:g}" for name, value in settings.lanes[seed].items())
             last = "none" if self.saved_step is None else f"step {self.saved_step}"
             raise Diverged(
                 f"{what} of {lane}, {member}, stopped being finite between steps {before} "
@@ -278,12 +296,27 @@ def _heeding_signals() -> Iterator[_Stop]:
 
 
 @contextmanager
+def _alone_in(run_dir: Path) -> Iterator[None]:
+    """Keeps a second process from writing into the same run, as long as this one lives."""
+    handle = os.open(run_dir, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError:
+        raise SettingError(f"run_dir={run_dir}: another process is training in it") from None
+    finally:
+        os.close(handle)
+
+
+@contextmanager
 def _disk_errors(run_dir: Path) -> Iterator[None]:
     """Turns a disk that cannot be written into one line."""
     try:
         yield
     except OSError as error:
-        reason = os.strerror(error.errno or errno.EIO)
+        if error.errno not in DISK_ERRORS:
+            raise
+        reason = os.strerror(error.errno)
     except ValueError as error:  # orbax's storage layer reports a full disk so
         if "No space left" not in str(error) and "RESOURCE_EXHAUSTED" not in str(error):
             raise

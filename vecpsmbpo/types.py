@@ -168,13 +168,13 @@ class Bandit(struct.PyTreeNode):
     Attributes:
         log_weights: [K].
         arm: [] int, in force.
-        compares: [] bool, whether there was an epoch before.
+        rounds: [] int, epochs so far.
         previous, lowest, highest: [], mean returns: of the epoch before, and of all so far.
     """
 
     log_weights: jax.Array
     arm: jax.Array
-    compares: jax.Array
+    rounds: jax.Array
     previous: jax.Array
     lowest: jax.Array
     highest: jax.Array

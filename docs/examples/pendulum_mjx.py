@@ -34,7 +34,7 @@ class Pendulum(MjxEnv):
     """Reward (1 + cos θ) / 2, θ = 0 upright, less a little for effort; never ends."""
 
     # Imagined rollouts need the termination rule as a function of observations. `never`, one of your own,
-    # or None: then the dynamics models learn it.
+    # or None: then the dynamics models learn what the method `terminated` says.
     spec = EnvSpec("pendulum", obs_size=3, action_size=1, episode_length=200, terminated=termination.never)
 
     def __init__(self):

@@ -3,7 +3,8 @@
     cd docs/examples
     vecpsmbpo train env=custom env.make=point_mass_gymnasium:PointMass backend=host episode_length=100 size=cpu
 
-Numbers and arrays that the environment keeps on itself are part of the checkpoint; so is its `np_random`.
+Numbers, arrays, and lists and dictionaries of them that the environment keeps on itself are part of the checkpoint; so
+is its `np_random`. What it keeps in objects of other kinds is not.
 """
 
 import gymnasium

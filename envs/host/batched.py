@@ -10,15 +10,18 @@ from vecpsmbpo.types import EnvSpec
 
 
 class Simulator(abc.ABC):
-    """One original simulator, with actions in [-1, 1] and no time limit of its own."""
+    """One original simulator, with actions in [-1, 1]; its time limit, where that is known, is HostEnv's."""
 
     @abc.abstractmethod
     def reset(self) -> np.ndarray:
         """Begins an episode: obs [O]."""
 
     @abc.abstractmethod
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
-        """One control step: action [A] -> obs [O], reward, terminated."""
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+        """One control step: action [A] -> obs [O], reward, terminated, truncated.
+
+        `truncated`: the episode ends here for a reason that is no part of the task, other than HostEnv's time limit.
+        """
 
     @abc.abstractmethod
     def save(self) -> dict[str, Any]:
@@ -36,7 +39,7 @@ class HostStep(NamedTuple):
         obs: [B, O] the states that the next actions start from: after the automatic reset where an episode ended.
         reward: [B].
         terminated: [B] bool.
-        truncated: [B] bool, the time limit was reached.
+        truncated: [B] bool, the episode ended for another reason, as a rule its time limit.
         next_obs: [B, O] the true successors, also where an episode ended.
     """
 
@@ -84,10 +87,10 @@ class HostEnv:
             raise ValueError(f"actions must have shape {expected}, not {np.shape(actions)}")
         actions = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
         results = [simulator.step(action) for simulator, action in zip(self.simulators, actions, strict=True)]
-        next_obs, reward, terminated = (np.asarray(column) for column in zip(*results, strict=True))
+        next_obs, reward, terminated, cut = (np.asarray(column) for column in zip(*results, strict=True))
         next_obs = next_obs.astype(np.float32)
         self._lengths += 1
-        truncated = (self._lengths >= self.episode_length) & ~terminated
+        truncated = (cut | (self._lengths >= self.episode_length)) & ~terminated
         self._obs = next_obs.copy()
         for index in np.flatnonzero(terminated | truncated):
             self._obs[index] = self.simulators[index].reset()

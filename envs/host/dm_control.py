@@ -42,11 +42,11 @@ class DmControlSimulator(Simulator):
         self._state.begin_episode()
         return obs
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         self._state.begin_step(action)
         timestep = self.env.step(self._low + (action + 1) * (self._high - self._low) / 2)
         terminated = bool(timestep.last() and timestep.discount == 0.0)
-        return _flat(timestep.observation), float(timestep.reward), terminated
+        return _flat(timestep.observation), float(timestep.reward), terminated, timestep.last() and not terminated
 
     def save(self) -> dict[str, Any]:
         generator = self.env.task.random.get_state(legacy=False)

@@ -1,6 +1,7 @@
 """Gymnasium's tasks on their own simulators."""
 
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
@@ -11,7 +12,7 @@ from vecpsmbpo.envs.host import attributes
 from vecpsmbpo.envs.host.batched import HostEnv, Simulator
 from vecpsmbpo.envs.host.mujoco_state import MujocoState
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.types import EnvSpec
+from vecpsmbpo.types import EnvSpec, TerminationRule
 
 EPISODE_LENGTH = 1000  # of a task that is registered without a limit
 
@@ -22,7 +23,7 @@ class GymnasiumSimulator(Simulator):
     def __init__(self, env: Any, seed: int, name: str):
         """
         Args:
-            env: a `gymnasium.Env`; its truncations are not heeded, the time limit is HostEnv's.
+            env: a `gymnasium.Env`.
             name: for errors.
 
         Raises:
@@ -42,21 +43,29 @@ class GymnasiumSimulator(Simulator):
             self._state.begin_episode()
         return obs
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         if self._state:
             self._state.begin_step(action)
         scaled = self._low + (action + 1) * (self._high - self._low) / 2
-        obs, reward, terminated, _, _ = self.env.step(scaled.astype(self.env.action_space.dtype))
-        return obs, float(reward), bool(terminated)
+        obs, reward, terminated, truncated, _ = self.env.step(scaled.astype(self.env.action_space.dtype))
+        return obs, float(reward), bool(terminated), bool(truncated)
 
     def save(self) -> dict[str, Any]:
         core = self.env.unwrapped
         return {
             "seed": self._seed,
             "physics": self._state.save() if self._state else None,
-            "attributes": attributes.save(core),
+            "attributes": [attributes.save(layer) for layer in self._layers()],
             "generator": core.np_random.bit_generator.state,
         }
+
+    def _layers(self) -> Iterator[Any]:
+        """The environment's wrappers, the outermost first, and itself."""
+        layer = self.env
+        while layer is not self.env.unwrapped:
+            yield layer
+            layer = layer.env
+        yield layer
 
     def load(self, saved: dict[str, Any]) -> None:
         self.env.reset()  # wrappers refuse a step before it
@@ -66,7 +75,8 @@ class GymnasiumSimulator(Simulator):
             action = self._state.load(saved["physics"])
             if action is not None:
                 self.step(action)
-        attributes.load(core, saved["attributes"])
+        for layer, values in zip(self._layers(), saved["attributes"], strict=True):
+            attributes.load(layer, values)
         core.np_random.bit_generator.state = saved["generator"]
 
 
@@ -99,19 +109,19 @@ def any_task(*, num_envs: int, seed: int, id: str) -> HostEnv:
                 warnings.filterwarnings("ignore", message=".*out of date.*")  # the paper's tasks are the v4 ones
                 # No time limit of its own (-1): that is HostEnv's.
                 return gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True)
-        except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        except (gymnasium.error.Error, ImportError) as error:
             raise SettingError(f"env.id={id}: {str(error).splitlines()[0]}") from None
 
-    return batch(make, num_envs, seed, f"env.id={id}", id, termination.of_gymnasium(id))
+    simulators = [GymnasiumSimulator(make(), seed + index, f"env.id={id}") for index in range(num_envs)]
+    registered = simulators[0].env.spec.id  # `Hopper` is `Hopper-v5`
+    limit = gymnasium.spec(registered).max_episode_steps or EPISODE_LENGTH
+    return batch(simulators, registered, limit, termination.of_gymnasium(registered))
 
 
-def batch(make: Any, num_envs: int, seed: int, label: str, name: str, terminated: Any) -> HostEnv:
-    """`num_envs` environments of `make()`, with the spec read off the first."""
-    simulators = [GymnasiumSimulator(make(), seed + index, label) for index in range(num_envs)]
-    env = simulators[0].env
-    limit = (env.spec and gymnasium.spec(env.spec.id).max_episode_steps) or EPISODE_LENGTH
-    spec = EnvSpec(name, env.observation_space.shape[0], env.action_space.shape[0], limit, terminated)
-    return HostEnv(spec, simulators)
+def batch(simulators: list[GymnasiumSimulator], name: str, limit: int, terminated: TerminationRule | None) -> HostEnv:
+    """Simulators of one task, with the spec read off the first."""
+    obs, action = simulators[0].env.observation_space, simulators[0].env.action_space
+    return HostEnv(EnvSpec(name, obs.shape[0], action.shape[0], limit, terminated), simulators)
 
 
 def _of_paper(name: str, env_id: str, num_envs: int, seed: int) -> HostEnv:

@@ -61,10 +61,10 @@ class MetaworldSimulator(Simulator):
         self._state.begin_episode()
         return obs
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         self._state.begin_step(action)
         obs, reward, _, _, _ = self.env.step(action)  # Metaworld never terminates
-        return obs, float(reward), False
+        return obs, float(reward), False, False
 
     def save(self) -> dict[str, Any]:
         return {
@@ -95,10 +95,10 @@ class WindowOpenSimulator(MetaworldSimulator):
         self._slide = self.env.data.joint("window_slide")
         self._open = float(self.env.model.joint("window_slide").range[1])
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
-        obs, _, terminated = super().step(action)
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+        obs, _, terminated, truncated = super().step(action)
         is_open = abs(self._open - self._slide.qpos[0]) <= self._threshold
-        return obs, WINDOW_OPEN_REWARD if is_open else WINDOW_NOT_OPEN_REWARD, terminated
+        return obs, WINDOW_OPEN_REWARD if is_open else WINDOW_NOT_OPEN_REWARD, terminated, truncated
 
 
 def window_open(*, num_envs: int, seed: int, threshold: float = WINDOW_THRESHOLD) -> HostEnv:

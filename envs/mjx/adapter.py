@@ -20,10 +20,20 @@ class Adapter(SpecEnv):
         inner: the environment; `reset(key)` and `step(state, action)` give states with `obs`, `reward`, `done`.
     """
 
-    def __init__(self, inner: Any, label: str, name: str, episode_length: int, terminated: TerminationRule | None):
+    def __init__(
+        self,
+        inner: Any,
+        label: str,
+        name: str,
+        episode_length: int,
+        terminated: TerminationRule | None,
+        action_repeat: int = 1,
+    ):
         """
         Args:
             label: for errors, such as `env.id=reacher`.
+            episode_length: steps of `inner`.
+            action_repeat: steps of `inner` that one action is held for; their rewards are added.
 
         Raises:
             SettingError: its observations are not one vector.
@@ -32,17 +42,24 @@ class Adapter(SpecEnv):
         if not isinstance(size, int):
             raise SettingError(f"{label}: its observations are {size}; only one vector can be learned")
         self.inner = inner
-        self.spec = EnvSpec(name, size, inner.action_size, episode_length, terminated)
+        self._action_repeat = action_repeat
+        self.spec = EnvSpec(name, size, inner.action_size, episode_length // action_repeat, terminated)
 
     def reset(self, rng: jax.Array) -> State:
         return self._shown(self.inner.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
-        inner: Any = state.pipeline_state
-        with jax.default_matmul_precision("highest"):  # as for the ports: TF32 hurts physics
-            after = self.inner.step(inner, jnp.clip(action, -1.0, 1.0))
-        # Scans and checkpoints need every leaf to keep its type.
-        return self._shown(jax.tree.map(lambda new, old: jnp.asarray(new, jnp.asarray(old).dtype), after, inner))
+        action = jnp.clip(action, -1.0, 1.0)
+
+        def once(inner: Any, _: None) -> tuple[Any, jax.Array]:
+            with jax.default_matmul_precision("highest"):  # as for the ports: TF32 hurts physics
+                after = self.inner.step(inner, action)
+            # Scans and checkpoints need every leaf to keep its type.
+            after = jax.tree.map(lambda new, old: jnp.asarray(new, jnp.asarray(old).dtype), after, inner)
+            return after, after.reward
+
+        inner, rewards = jax.lax.scan(once, state.pipeline_state, length=self._action_repeat)
+        return self._shown(inner).replace(reward=jnp.sum(rewards).astype(jnp.float32))
 
     def _shown(self, inner: Any) -> State:
         obs, reward, done = (jnp.asarray(x, jnp.float32) for x in (inner.obs, inner.reward, inner.done))

@@ -24,6 +24,6 @@ class Ant(Locomotion):
         # The original takes the torso's body frame, which lags behind qpos.
         return physics.seen[0]
 
-    def terminated(self, physics: Physics) -> jax.Array:
+    def terminated(self, obs: jax.Array, action: jax.Array, after: Physics) -> jax.Array:
         # The original also tests x and y, which it does not show, for being finite.
-        return super().terminated(physics) | ~jnp.all(jnp.isfinite(physics.qpos))
+        return super().terminated(obs, action, after) | ~jnp.all(jnp.isfinite(after.qpos))

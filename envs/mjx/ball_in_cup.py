@@ -8,7 +8,7 @@ from dm_control.suite import ball_in_cup
 
 from vecpsmbpo.envs import specs
 from vecpsmbpo.envs.mjx.base import MjxEnv
-from vecpsmbpo.envs.mjx.simulator import Physics
+from vecpsmbpo.envs.mjx.simulator import LINE_SEARCH_ITERATIONS, Physics
 
 CONTROL_TIMESTEP = 0.02
 RESET_X, RESET_Z = (-0.2, 0.2), (0.2, 0.5)
@@ -25,7 +25,8 @@ class BallInCup(MjxEnv):
     def __init__(self):
         xml, assets = ball_in_cup.get_model_and_assets()
         model = mujoco.MjModel.from_xml_string(xml, assets)
-        super().__init__(model, substeps=round(CONTROL_TIMESTEP / model.opt.timestep))
+        substeps = round(CONTROL_TIMESTEP / model.opt.timestep)
+        super().__init__(model, substeps, line_search_iterations=LINE_SEARCH_ITERATIONS)
         self._ball_rest = model.body("ball").pos[[0, 2]]
         self._target_rest = (model.body("cup").pos + model.site("target").pos)[[0, 2]]
         self._reach = model.site("target").size[[0, 2]] - model.geom("ball").size[0]

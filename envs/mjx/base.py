@@ -37,15 +37,16 @@ class MjxEnv(SpecEnv):
     only.
     """
 
-    def __init__(self, model: mujoco.MjModel, substeps: int):
+    def __init__(self, model: mujoco.MjModel, substeps: int, *, line_search_iterations: int | None = None):
         """
         Args:
             model: of the original task, unchanged.
             substeps: simulator steps per control step.
+            line_search_iterations: most of them, see `simulator.LINE_SEARCH_ITERATIONS`; None: as the model says.
         """
         self.model = model
         self.substeps = substeps
-        self._simulator = Simulator(model)
+        self._simulator = Simulator(model, line_search_iterations)
 
     # what a task defines
 
@@ -61,10 +62,13 @@ class MjxEnv(SpecEnv):
     def reward(self, before: Physics, action: jax.Array, after: Physics) -> jax.Array:
         """[], for the control step that led from `before` to `after`."""
 
-    def terminated(self, physics: Physics) -> jax.Array:
-        """[] bool, by the spec's rule on the observation; never where it has none. A task may know better."""
-        obs, rule = self.observe(physics), self.spec.terminated
-        return rule(obs, obs, obs) if rule else jnp.bool_(False)
+    def terminated(self, obs: jax.Array, action: jax.Array, after: Physics) -> jax.Array:
+        """[] bool, for the control step from `obs` to `after`: by the spec's rule on observations.
+
+        A task whose spec has no rule, or that knows better than observations tell, overrides this.
+        """
+        rule = self.spec.terminated
+        return rule(obs, action, self.observe(after)) if rule else jnp.bool_(False)
 
     # the environment
 
@@ -87,7 +91,7 @@ class MjxEnv(SpecEnv):
                 pipeline_state=after,
                 obs=self.observe(after),
                 reward=self.reward(before, action, after),
-                done=self.terminated(after).astype(jnp.float32),
+                done=self.terminated(state.obs, action, after).astype(jnp.float32),
             )
 
     def control(self, action: jax.Array) -> jax.Array:

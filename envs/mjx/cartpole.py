@@ -7,7 +7,7 @@ from dm_control.suite import cartpole
 
 from vecpsmbpo.envs import specs
 from vecpsmbpo.envs.mjx.base import MjxEnv
-from vecpsmbpo.envs.mjx.simulator import Physics
+from vecpsmbpo.envs.mjx.simulator import LINE_SEARCH_ITERATIONS, Physics
 from vecpsmbpo.envs.mjx.tolerance import tolerance
 
 CART_RANGE = (-0.25, 0.25)
@@ -26,7 +26,7 @@ class CartpoleSwingup(MjxEnv):
         xml, assets = cartpole.get_model_and_assets()
         model = mujoco.MjModel.from_xml_string(xml, assets)
         model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)  # a read-out that MJX refuses
-        super().__init__(model, substeps=1)
+        super().__init__(model, substeps=1, line_search_iterations=LINE_SEARCH_ITERATIONS)
 
     def initial_state(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         position_key, velocity_key = jax.random.split(key)

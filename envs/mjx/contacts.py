@@ -2,7 +2,7 @@
 
 Between a plane and a capsule, C MuJoCo's first tangent is the capsule's axis projected on the plane. MJX 3.16 does the
 same, but for capsules steeper than 60° it takes a fixed direction instead. With pyramidal friction cones the tangents
-matter: ant's velocities after one control step were off by up to 1. This is the one place that reads
+matter: ant's velocities after one control step were off by up to 1. This is the one place that depends on
 MJX's private layout of contacts (`data._impl.contact`); tests/test_simulator.py fails when it changes.
 """
 

@@ -16,7 +16,7 @@ class Hopper(UprightLocomotion):
     def __init__(self):
         super().__init__("hopper.xml", substeps=4)
 
-    def terminated(self, physics: Physics) -> jax.Array:
+    def terminated(self, obs: jax.Array, action: jax.Array, after: Physics) -> jax.Array:
         # The original tests the velocities themselves, not the clipped ones that it shows.
-        state = jnp.concatenate([physics.qpos[1:], physics.qvel])
-        return termination.hopper_falls(state, state, state)
+        state = jnp.concatenate([after.qpos[1:], after.qvel])
+        return termination.hopper_falls(obs, action, state)

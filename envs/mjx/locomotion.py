@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 
 from vecpsmbpo.envs.mjx.base import MjxEnv
-from vecpsmbpo.envs.mjx.simulator import Physics
+from vecpsmbpo.envs.mjx.simulator import LINE_SEARCH_ITERATIONS, Physics
 
 ASSETS = Path(gymnasium_mujoco.__file__).parent / "assets"
 
@@ -27,7 +27,8 @@ class Locomotion(MjxEnv):
     control_cost: float
 
     def __init__(self, xml: str, substeps: int):
-        super().__init__(mujoco.MjModel.from_xml_path(str(ASSETS / xml)), substeps)
+        model = mujoco.MjModel.from_xml_path(str(ASSETS / xml))
+        super().__init__(model, substeps, line_search_iterations=LINE_SEARCH_ITERATIONS)
         self.dt = substeps * self.model.opt.timestep
         self._qpos0 = jnp.asarray(self.model.qpos0, jnp.float32)
 

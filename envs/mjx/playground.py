@@ -21,4 +21,5 @@ def any_task(*, id: str) -> Env:
     if "impl" in options:
         options.impl = "jax"
     rule = termination.never if id in registry.dm_control_suite.ALL_ENVS else None
-    return Adapter(registry.load(id, config=options), f"env.id={id}", id, options.episode_length, rule)
+    inner, repeat = registry.load(id, config=options), options.get("action_repeat", 1)
+    return Adapter(inner, f"env.id={id}", id, options.episode_length, rule, action_repeat=repeat)

@@ -28,48 +28,59 @@ class PsMbpo(Algorithm):
         """An action sampled from the policy of the episode's member, or with `posterior=average` from all members'."""
         actors = state.agents.actor
         if self.settings.posterior == "average":
-            return self._sample_mixture(actors, obs, key), ()
-        return self._sample(state.episode.member, actors, obs, key), ()
+            return self._of_mixture(actors, obs, key), ()
+        return self._of_member(state.episode.member, actors, obs, key), ()
 
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> Params:
         """Parameters for `evaluation_action`, by `eval_policy`: of the member that the posterior would pick now, of the
         member that has earned the most, or of all members."""
-        if self._evaluates_average:
+        if self._evaluates_all:
             return state.agents.actor
-        scores = posterior.logits(state.posterior, state.hyper.temperature)
-        drawn, _ = posterior.draw(state.posterior, state.hyper.temperature, key)
-        member = jnp.argmax(scores) if self.settings.eval_policy == "best" else drawn
+        if self.settings.eval_policy == "best":
+            member = posterior.best(state.posterior)
+        else:
+            member, _ = posterior.draw(state.posterior, state.hyper.temperature, key)
         return self.layout.ask(member, state.agents.actor)
 
     def evaluation_action(
         self, policy: Params, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, Any]:
-        """The mean action, for `average` averaged over the members; or a sample, as `choose` takes it."""
-        sampled, actor = self.settings.eval_actions == "sampled", self._actor
-        if not self._evaluates_average:
-            law = actor.law(policy, obs)
+        """The mean action or a sample of it: of the member chosen; with `posterior=average` of a member drawn at every
+        step, as `choose` does; with `eval_policy=average` the average of all members' mean actions."""
+        sampled = self.settings.eval_actions == "sampled"
+        if not self._evaluates_all:
+            law = self._actor.law(policy, obs)
             return (law.sample(key)[0] if sampled else law.mode()), ()
-        if sampled:
-            return self._sample_mixture(policy, obs, key), ()
-        return self.layout.mean_over_members(jax.vmap(lambda params: actor.law(params, obs).mode())(policy)), ()
+        if sampled or self.settings.eval_policy == "posterior":
+            return self._of_mixture(policy, obs, key, sampled=sampled), ()
+        modes = jax.vmap(lambda params: self._actor.law(params, obs).mode())(policy)
+        return self.layout.mean_over_members(modes), ()
 
-    def _sample(self, member: jax.Array, actors: Params, obs: jax.Array, key: jax.Array) -> jax.Array:
-        """[A] an action of one member."""
-        return self.layout.ask(member, actors, lambda params: self._actor.law(params, obs).sample(key)[0])
+    def _of_member(
+        self, member: jax.Array, actors: Params, obs: jax.Array, key: jax.Array, *, sampled: bool = True
+    ) -> jax.Array:
+        """[A] an action of one member: a sample, or its mean."""
 
-    def _sample_mixture(self, actors: Params, obs: jax.Array, key: jax.Array) -> jax.Array:
+        def action(params: Params) -> jax.Array:
+            law = self._actor.law(params, obs)
+            return law.sample(key)[0] if sampled else law.mode()
+
+        return self.layout.ask(member, actors, action)
+
+    def _of_mixture(self, actors: Params, obs: jax.Array, key: jax.Array, *, sampled: bool = True) -> jax.Array:
         """[A] an action of the average of all members' action distributions (figure 6), their mixture with equal
         weights: a member drawn anew at every step, and its action. (Averaging the actions instead would take one that
         none of them considers good, wherever they disagree.)"""
         key, member_key = jax.random.split(key)
-        return self._sample(jax.random.randint(member_key, (), 0, self.settings.n_members), actors, obs, key)
+        member = jax.random.randint(member_key, (), 0, self.settings.n_members)
+        return self._of_member(member, actors, obs, key, sampled=sampled)
 
     @property
     def _actor(self) -> Actor:
         return sac.make_networks(self.settings, self.spec).actor
 
     @property
-    def _evaluates_average(self) -> bool:
+    def _evaluates_all(self) -> bool:
         chosen = self.settings.eval_policy
         return chosen == "average" or (chosen == "posterior" and self.settings.posterior == "average")
 
@@ -147,7 +158,7 @@ class PsMbpo(Algorithm):
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings
         updates = len(learning) * settings.updates_per_step * settings.n_members
-        if settings.real_ratio == 1:
+        if not settings.imagines:
             return updates, 0
         rows = imagination.rows_per_refresh(settings, jnp.asarray(refreshes))
         return updates, int(np.sum(rows)) * settings.n_members

@@ -8,7 +8,7 @@ import numpy as np
 
 from vecpsmbpo import dynamics, imagination, multistep, trpo
 from vecpsmbpo.algorithms.base import Algorithm
-from vecpsmbpo.types import Counters, Model, Params, SeedState
+from vecpsmbpo.types import Counters, Model, Params, Scaling, SeedState
 
 
 class Slbo(Algorithm):
@@ -19,18 +19,24 @@ class Slbo(Algorithm):
 
     def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
         """A sample of the policy, clipped."""
+        obs = _whitened(self._scaling(state), obs)
         sample = lambda params: self._nets.policy.law(params, obs).sample(key)  # noqa: E731
         return jnp.clip(self.layout.ask(state.episode.member, state.agents.policy, sample), -1.0, 1.0), ()
 
-    def evaluation_policy(self, state: SeedState, key: jax.Array) -> Params:
-        return self.layout.ask(jnp.int32(0), state.agents.policy)
+    def evaluation_policy(self, state: SeedState, key: jax.Array) -> tuple[Params, Scaling]:
+        return self.layout.ask(jnp.int32(0), state.agents.policy), self._scaling(state)
 
     def evaluation_action(
-        self, policy: Params, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
+        self, policy: tuple[Params, Scaling], step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, Any]:
-        law = self._nets.policy.law(policy, obs)
+        params, scaling = policy
+        law = self._nets.policy.law(params, _whitened(scaling, obs))
         action = law.loc if self.settings.eval_actions == "mean" else law.sample(key)
         return jnp.clip(action, -1.0, 1.0), ()
+
+    def _scaling(self, state: SeedState) -> Scaling:
+        """That the policy was trained with: of its model, at the last refresh."""
+        return jax.tree.map(lambda x: x[0], self.layout.all_models(state.models.scaling))
 
     def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""
@@ -67,6 +73,7 @@ class Slbo(Algorithm):
         self, counters: Counters, real: jax.Array, model: Model, policy: Params, key: jax.Array
     ) -> trpo.Rollouts:
         """Rollouts of the policy in the model's mean, from real states; one that terminates begins again from another.
+        Their observations are whitened, as policy and value function take them.
 
         SLBO's code starts them from the environment's initial states, which a model cannot draw.
         """
@@ -76,15 +83,17 @@ class Slbo(Algorithm):
         def real_states(key):
             return imagination.start_states(real, counters.env_steps, key, count, spec)
 
+        def seen(obs):
+            return _whitened(model.scaling, obs)
+
         def step(obs, xs):
             t, key = xs
             action_key, model_key, fresh_key = jax.random.split(key, 3)
-            action = self._nets.policy.law(policy, obs).sample(action_key)
+            action = self._nets.policy.law(policy, seen(obs)).sample(action_key)
             answer = dynamics.predict_mean(model, obs, jnp.clip(action, -1.0, 1.0), model_key, net=net, spec=spec)
             ended = answer.terminated | (t == length - 1)
-            row = trpo.Rollouts(
-                obs, action, answer.reward, answer.next_obs, answer.terminated.astype(jnp.float32), ended
-            )
+            terminated = answer.terminated.astype(jnp.float32)
+            row = trpo.Rollouts(seen(obs), action, answer.reward, seen(answer.next_obs), terminated, ended)
             return jnp.where(answer.terminated[:, None], real_states(fresh_key), answer.next_obs), row
 
         start_key, step_key = jax.random.split(key)
@@ -99,3 +108,9 @@ class Slbo(Algorithm):
     @property
     def _nets(self) -> trpo.Networks:
         return trpo.make_networks(self.settings, self.spec)
+
+
+def _whitened(scaling: Scaling, obs: jax.Array) -> jax.Array:
+    """Observations [..., O] as policy and value function take them."""
+    size = obs.shape[-1]
+    return (obs - scaling.input_mean[:size]) / scaling.input_std[:size]

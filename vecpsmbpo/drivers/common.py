@@ -5,7 +5,10 @@ acts, observes and learns. A chunk is a number of strides, a few steps each, dec
 compiled program serves chunks of any length, and how a run is cut into chunks does not change it.
 """
 
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -19,6 +22,7 @@ from vecpsmbpo.layout import SEEDS, Layout
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
 
 SHARED, BY_SEED = PartitionSpec(), PartitionSpec(SEEDS)
+COMPILER_STACK = 64 * 2**20  # bytes
 
 
 class Returns(NamedTuple):
@@ -38,6 +42,9 @@ class Driver(Protocol):
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         """The state before the first step, laid out on the mesh. keys [S], hyper leaves [S]."""
 
+    def shapes(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        """What `init` would give, as shapes; nothing is allocated and no simulator is moved."""
+
     def compile(self, state: TrainState) -> None:
         """Builds the programs, so that the first chunk does not have to."""
 
@@ -52,6 +59,23 @@ class Driver(Protocol):
 
     def load_env(self, saved: dict[str, Any]) -> None:
         """The inverse of `save_env`."""
+
+
+def compiled(programs: Sequence[tuple[Any, tuple]]) -> tuple[list[Any], float]:
+    """Jitted functions and the arguments (or shapes) of each, compiled at once; and the seconds it took.
+
+    XLA compiles outside of Python's lock: together they cost the longest one. It recurses deeper than a thread's usual
+    stack allows (jax 0.11.2 crashes).
+    """
+    began = time.perf_counter()
+    lowered = [program.lower(*arguments) for program, arguments in programs]
+    usual = threading.stack_size(COMPILER_STACK)
+    try:
+        with ThreadPoolExecutor() as pool:
+            executables = list(pool.map(lambda program: program.compile(), lowered))
+    finally:
+        threading.stack_size(usual)
+    return executables, time.perf_counter() - began
 
 
 # ── what both drivers run, for this device's share ───────────────────────────────────────────────────────────────
@@ -79,7 +103,9 @@ def begin_stride(algorithm: Algorithm, state: TrainState) -> tuple[TrainState, j
     advanced, keys = split_keys(seeds, 2)
     seeds = seeds.replace(key=jnp.where(into_period == 0, advanced.key, seeds.key))
     seeds = over_seeds(algorithm.begin_epoch)(counters, seeds, keys[:, 0])
-    only_real = over_seeds(algorithm.real_ratio)(counters, seeds) >= 1
+    # λ may fall from 1 within the period (it never rises in one): what it then draws from must be there.
+    last = counters._replace(env_steps=counters.env_steps + algorithm.settings.model_update_every)
+    only_real = over_seeds(algorithm.real_ratio)(last, seeds) >= 1
     imagining = (into_period == 0) & learning & algorithm.layout.any_seed(~only_real)
     seeds = over_seeds(lambda c, s, k: algorithm.refresh(c, s, imagining, k))(counters, seeds, keys[:, 1])
     counters = counters._replace(imagined_rows=algorithm.imagined_rows(counters, imagining))

@@ -15,6 +15,7 @@ from vecpsmbpo.drivers.common import (
     SHARED,
     Returns,
     begin_stride,
+    compiled,
     evaluation_actions,
     evaluation_policies,
     many,
@@ -61,12 +62,33 @@ class HostDriver:
             (BY_SEED, SHARED, BY_SEED, BY_SEED, BY_SEED),
             (BY_SEED, BY_SEED),
         )
+        self._compiled_evaluation_actions: Any = None
 
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         return self._init(keys, hyper, jnp.asarray(self._env.reset()))
 
+    def shapes(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        return jax.eval_shape(self._init, keys, hyper, self._shape(self.algorithm.spec.obs_size))
+
     def compile(self, state: TrainState) -> None:
-        pass  # each function is compiled when it is first needed
+        spec, seeds, episodes = self.algorithm.spec, self.layout.num_seeds, self.settings.eval_episodes
+        obs, number = self._shape(spec.obs_size), self._shape()
+        action, memory, keys = jax.eval_shape(self._act, state.counters, state.seeds, obs)
+        _, learning = jax.eval_shape(self._begin, state)
+        transition, flag = Transition(obs, action, number, obs, number), jax.ShapeDtypeStruct((seeds,), bool)
+        episode_keys = jax.eval_shape(lambda key: split_for_episodes(key, episodes)[:, 1:], state.seeds.key)
+        policies = jax.eval_shape(self._policies, state.seeds, state.seeds.key)
+        remembered = jax.eval_shape(lambda: many(self.algorithm.memory(), seeds, episodes))
+        states = self._shape(episodes, spec.obs_size)
+        programs = [
+            (self._begin, (state,)),
+            (self._act, (state.counters, state.seeds, obs)),
+            (self._observe, (state, memory, transition, flag, keys, obs, learning)),
+            (self._policies, (state.seeds, state.seeds.key)),
+            (self._evaluation_actions, (policies, jnp.int32(0), remembered, states, episode_keys)),
+        ]
+        executables, self.compile_seconds = compiled(programs)
+        self._begin, self._act, self._observe, self._policies, self._compiled_evaluation_actions = executables
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
         news = []
@@ -94,14 +116,15 @@ class HostDriver:
         env = self._make_env(num_envs=seeds * episodes, seed=env_seed)
         env.episode_length = self.settings.episode_length
         obs = env.reset()
-        count = seeds * episodes
+        compiled_for = self._compiled_evaluation_actions if episodes == self.settings.eval_episodes else None
+        act, count = compiled_for or self._evaluation_actions, seeds * episodes
         memory = many(self.algorithm.memory(), seeds, episodes)
         total, length, alive = np.zeros(count), np.zeros(count, int), np.ones(count, bool)
         for t in itertools.count():
             if not alive.any():
                 break
             states = obs.reshape(seeds, episodes, obs_size)
-            action, memory = self._evaluation_actions(policies, jnp.int32(t), memory, states, split[:, 1:])
+            action, memory = act(policies, jnp.int32(t), memory, states, split[:, 1:])
             step = env.step(np.asarray(action).reshape(count, -1))
             obs = step.obs
             total += np.where(alive, step.reward, 0.0)
@@ -114,6 +137,10 @@ class HostDriver:
 
     def load_env(self, saved: dict[str, Any]) -> None:
         self._env.load(saved)
+
+    def _shape(self, *size: int) -> Any:
+        """Of float32 numbers [S, *size]."""
+        return jax.ShapeDtypeStruct((self.layout.num_seeds, *size), jnp.float32)
 
     def _init_local(self, keys: jax.Array, hyper: Hyper, obs: jax.Array) -> TrainState:
         counters = Counters(env_steps=jnp.int32(0), imagined_rows=jnp.int32(0))

@@ -1,8 +1,5 @@
 """MJX environments: real steps, refits, rollouts and updates as one compiled program over the mesh."""
 
-import threading
-import time
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -16,6 +13,7 @@ from vecpsmbpo.drivers.common import (
     SHARED,
     Returns,
     begin_stride,
+    compiled,
     evaluation_actions,
     many,
     observe_and_learn,
@@ -26,8 +24,6 @@ from vecpsmbpo.drivers.common import (
 from vecpsmbpo.layout import SEEDS
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
-
-COMPILER_STACK = 64 * 2**20  # bytes
 
 _LOG = PartitionSpec(None, None, SEEDS)
 
@@ -50,17 +46,13 @@ class ScanDriver:
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         return self._init(keys, hyper)
 
+    def shapes(self, keys: jax.Array, hyper: Hyper) -> TrainState:
+        return jax.eval_shape(self._init, keys, hyper)
+
     def compile(self, state: TrainState) -> None:
-        began = time.perf_counter()
         keys = jax.eval_shape(lambda key: split_for_episodes(key, self.settings.eval_episodes), state.seeds.key)
-        lowered = (self._run.lower(state, jnp.int32(1)), self._evaluate.lower(state.seeds, keys))
-        # XLA compiles outside of Python's lock: together they cost the longer one. It recurses deeper than a thread's
-        # usual stack allows (jax 0.11.2 crashes).
-        usual = threading.stack_size(COMPILER_STACK)
-        with ThreadPoolExecutor() as pool:
-            self._compiled, self._compiled_evaluate = pool.map(lambda program: program.compile(), lowered)
-        threading.stack_size(usual)
-        self.compile_seconds = time.perf_counter() - began
+        programs = [(self._run, (state, jnp.int32(1))), (self._evaluate, (state.seeds, keys))]
+        (self._compiled, self._compiled_evaluate), self.compile_seconds = compiled(programs)
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
         state, log = (self._compiled or self._run)(state, jnp.int32(strides))
