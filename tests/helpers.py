@@ -88,6 +88,17 @@ def check_log(run_dir: Path, settings) -> None:
     assert list((run_dir / "tensorboard").iterdir())
 
 
+def assert_probabilities_follow(lines: list[dict], n_models: int, settings: Settings) -> np.ndarray:
+    """Equation 19 from the episodes of one lane alone; what each member has earned [N, M] at their end."""
+    earned = np.zeros((n_models, settings.n_policies))
+    for line in lines:
+        logits = (earned - earned.max()) / settings.temperature
+        np.testing.assert_allclose(line["probs"], np.exp(logits) / np.exp(logits).sum(), atol=1e-5)
+        if not line["random"]:
+            earned[line["model"], line["policy"]] += line["return"]
+    return earned
+
+
 def assert_resumes_exactly(env: HostEnv, other: HostEnv, episode_length: int) -> None:
     """What `env` saves, `other` loads and goes on from, bit for bit.
 

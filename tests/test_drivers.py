@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests import probes
-from tests.helpers import algorithm, tiny
+from tests.helpers import algorithm, assert_probabilities_follow, tiny
 from vecpsmbpo import metrics, replay, sac
 from vecpsmbpo.drivers import HostDriver, ScanDriver
 from vecpsmbpo.train import evaluation_keys, initial_inputs
@@ -121,13 +121,8 @@ def test_episodes_are_accounted_for(trained):
 
 def test_the_log_alone_gives_the_probabilities_of_equation_19(trained):
     settings, _, _, _, news = trained
-    earned = np.zeros((settings.n_members // settings.n_policies, settings.n_policies))
-    for line in metrics.episode_lines(news, 0, settings):
-        logits = (earned - earned.max()) / settings.temperature
-        np.testing.assert_allclose(line["probs"], np.exp(logits) / np.exp(logits).sum(), atol=1e-5)
-        if not line["random"]:
-            earned[line["model"], line["policy"]] += line["return"]
-    assert earned.sum() > 0
+    lines = metrics.episode_lines(news, 0, settings)
+    assert assert_probabilities_follow(lines, settings.n_members // settings.n_policies, settings).sum() > 0
 
 
 def test_evaluation_plays_whole_episodes_of_the_mean_action(trained):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.helpers import argv, check_log, command, environment, tiny
+from tests.helpers import argv, assert_probabilities_follow, check_log, command, environment, tiny
 from vecpsmbpo import checkpoint, config, evaluate, metrics, train
 from vecpsmbpo.settings import SettingError
 
@@ -140,13 +140,8 @@ def test_evaluation_of_a_run(undisturbed):
 def test_probabilities_can_be_recomputed_from_the_log(undisturbed):
     settings = config.load(undisturbed)
     for seed in (0, 1):
-        earned = np.zeros((settings.n_models, settings.n_policies))
-        for line in metrics.read(undisturbed / "episodes.jsonl"):
-            if line["seed"] == seed:
-                logits = (earned - earned.max()) / settings.temperature
-                np.testing.assert_allclose(line["probs"], np.exp(logits) / np.exp(logits).sum(), atol=1e-5)
-                if not line["random"]:
-                    earned[line["model"], line["policy"]] += line["return"]
+        lines = [line for line in metrics.read(undisturbed / "episodes.jsonl") if line["seed"] == seed]
+        assert_probabilities_follow(lines, settings.n_models, settings)
 
 
 # ── in this process: the loop around the program, with the program's parts damaged ──────────────────────────────

@@ -4,16 +4,20 @@
     python tools/bench.py capacity    cost of a step at a large and at a small replay capacity
     python tools/bench.py program     cost of a step of the whole program, against its SAC updates alone
     python tools/bench.py envs        steps per second and compile seconds of every task, on each backend and batch size
+    python tools/bench.py host        host simulators stepped in a loop, by threads and by processes
 
 Further arguments are settings, as for `vecpsmbpo train` (of `envs`: tasks). One line of JSON per measurement.
 """
 
 import json
+import os
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -109,11 +113,8 @@ def seconds_per_update(driver: ScanDriver, state: TrainState, repeats: int) -> f
 
 
 def seconds_per_step(driver: ScanDriver, repeats: int) -> float:
-    """Of a step inside the whole program: a chunk that learns, less what its refresh costs.
-
-    The refresh (models, imagination) is measured as a period of the same program in which real data alone is used.
-    """
-    state = past_warmup(driver, real_ratio=1.0)  # λ = 1: no refresh
+    """Of a step inside the whole program, without the refresh of models and imagined data: λ = 1 has none."""
+    state = past_warmup(driver, real_ratio=1.0)
     seconds = []
     for _ in range(repeats):
         began = time.perf_counter()
@@ -213,7 +214,43 @@ def host_steps(name: str, batch: int) -> dict[str, float]:
     return {"steps_per_s": batch * steps / best_seconds(run, 3)}
 
 
-BENCHES = {"envs": bench_envs, "updates": bench_updates, "capacity": bench_capacity, "program": bench_program}
+def bench_host() -> list[dict[str, Any]]:
+    """Steps per second of a batch of simulators: one after the other (as `HostEnv` does it), each handed to a pool of
+    threads or to a process of its own (Gymnasium's `AsyncVectorEnv`, which has Gymnasium's tasks only)."""
+    found = []
+    for name in sys.argv[2:] or ("hopper", "ball_in_cup", "window_open"):
+        for batch in (2, 10, 100):
+            env, steps = envs.make(name, "host", num_envs=batch), 50
+            env.reset()
+            actions = np.random.default_rng(0).uniform(-1, 1, (steps, batch, env.spec.action_size))
+            loop = best_seconds(lambda env=env, actions=actions: [env.step(action) for action in actions], 5)
+            env.reset()
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+
+                def threads(env=env, actions=actions, pool=pool):
+                    for action in actions:
+                        list(pool.map(lambda one, given: one.step(given), env.simulators, action))
+
+                threaded = best_seconds(threads, 5)
+            row = {"env": name, "batch": batch, "loop_steps_per_s": batch * steps / loop}
+            row["threads_steps_per_s"] = batch * steps / threaded
+            if name == "hopper" and batch <= 10:
+                vector = gymnasium.vector.AsyncVectorEnv([lambda: gymnasium.make("Hopper-v5")] * batch)
+                vector.reset()
+                processes = best_seconds(lambda v=vector, a=actions: [v.step(x.astype("float32")) for x in a], 5)
+                vector.close()
+                row["processes_steps_per_s"] = batch * steps / processes
+            found.append(row)
+    return found
+
+
+BENCHES = {
+    "envs": bench_envs,
+    "host": bench_host,
+    "updates": bench_updates,
+    "capacity": bench_capacity,
+    "program": bench_program,
+}
 
 if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in BENCHES:
