@@ -143,11 +143,13 @@ def test_inputs_are_whitened_by_all_the_data(trained):
 
 
 def test_an_epoch_compiles_once_whatever_the_data_size_and_chunks_do_not_matter():
-    """Chunks of 1, 8, 4 and 7 strides of half a period: one compilation, and the same run as a chunk of 20."""
+    """Chunks of 1, 8, 4 and 7 strides of half a period: one compilation, and the same run as a chunk of 20. Other
+    hyperparameters are no other program either."""
     settings = settings_for(updates_per_step=1)
     driver = make_driver("scan", True, settings)
     whole, _ = driver.run(driver.init(*initial_inputs(settings)), 20)
-    state = driver.init(*initial_inputs(settings))
+    keys, hyper = initial_inputs(settings)
+    state, changed = driver.init(keys, hyper), jax.tree.map(lambda x: 0.9 * x, hyper)
     compiled: list[str] = []
 
     def listen(event, duration, **kwargs):
@@ -158,12 +160,15 @@ def test_an_epoch_compiles_once_whatever_the_data_size_and_chunks_do_not_matter(
     try:
         for strides in (1, 8, 4, 7):
             state, _ = driver.run(state, strides)
+        other, _ = driver.run(driver.init(keys, changed), 20)
         assert not compiled
         jax.jit(lambda x: x + len(compiled))(jnp.ones(3))
         assert compiled  # the listener does hear compilations
     finally:
         jax.monitoring.clear_event_listeners()
     jax.tree.map(np.testing.assert_array_equal, whole.seeds.agents.actor, state.seeds.agents.actor)
+    different = jax.tree.map(lambda a, b: not np.array_equal(a, b), whole.seeds.agents.actor, other.seeds.agents.actor)
+    assert all(jax.tree.leaves(different))
 
 
 def test_only_real_data_needs_no_models():

@@ -12,7 +12,6 @@ from vecpsmbpo import sac
 from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs import specs
 from vecpsmbpo.layout import Layout, _mesh_shape
-from vecpsmbpo.train import initial_inputs
 from vecpsmbpo.types import Counters, TrainState
 
 SPEC = specs.get("ball_in_cup")
@@ -103,13 +102,6 @@ def test_place_is_the_inverse_of_unpad():
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(plain), strict=True):
         if not jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
             np.testing.assert_array_equal(a, b)
-
-
-def test_hyperparameters_are_traced():
-    settings = tiny()
-    keys, hyper = initial_inputs(dataclasses.replace(settings, num_seeds=3))
-    assert keys.shape == (3,)
-    assert {leaf.shape for leaf in jax.tree.leaves(hyper)} == {(3,)}
 
 
 @pytest.mark.parametrize(("seeds", "models"), [(1, 3), (2, 3)])

@@ -56,17 +56,26 @@ def assert_same_run(run_dir: Path, other: Path) -> None:
     check_log(run_dir, config.load(run_dir))
 
 
+def _is_saving(run_dir: Path) -> bool:
+    """Whether orbax is writing a checkpoint, which it renames when it is whole."""
+    return any("orbax-checkpoint-tmp" in path.name for path in (run_dir / "checkpoints").iterdir())
+
+
 def test_a_run_killed_again_and_again_is_the_undisturbed_run(undisturbed, tmp_path):
-    """kill -9 at random moments, the same command each time."""
+    """kill -9, the same command each time: at random moments, and twice in the middle of a save."""
     arguments = argv("train", *SMALL, "run_dir=run", one_thread=True)
     random = np.random.default_rng(0)
     kills = 0
-    for _ in range(5):
+    for attempt in range(5):
         process = subprocess.Popen(arguments, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, text=True)
         for line in process.stdout:  # compiling takes most of the time: wait for the work to begin
             if "compiled in" in line:
                 break
-        time.sleep(random.uniform(0.0, 1.5))
+        if attempt in (0, 3):
+            while process.poll() is None and not _is_saving(tmp_path / "run"):
+                time.sleep(1e-4)
+        else:
+            time.sleep(random.uniform(0.0, 1.5))
         if process.poll() is None:
             process.send_signal(signal.SIGKILL)
             kills += 1

@@ -87,7 +87,7 @@ class Scaling(NamedTuple):
     """Units of a model's inputs and outputs.
 
     Attributes:
-        input_mean, input_std: [O + A], of the data that the model was last fitted on (equation 20).
+        input_mean, input_std: [O + A], of all real data at the last fit (equation 20).
         output_std: [O + 1], of the changes and the reward; 1 where they are predicted as they are (A.1).
     """
 
