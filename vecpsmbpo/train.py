@@ -1,5 +1,6 @@
 """The one loop that does input and output: chunks of the compiled program, and what is kept of them."""
 
+import contextlib
 import dataclasses
 import errno
 import fcntl
@@ -9,7 +10,6 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -276,7 +276,7 @@ class _Stop:
     requested: int | None = None
 
 
-@contextmanager
+@contextlib.contextmanager
 def _heeding_signals() -> Iterator[_Stop]:
     """SIGINT and SIGTERM ask the run to stop after its chunk; a second one stops it at once."""
     stop = _Stop()
@@ -295,20 +295,22 @@ def _heeding_signals() -> Iterator[_Stop]:
             signal.signal(number, handler)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _alone_in(run_dir: Path) -> Iterator[None]:
     """Keeps a second process from writing into the same run, as long as this one lives."""
     handle = os.open(run_dir, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with contextlib.suppress(OSError):  # some network file systems have no locks
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise SettingError(f"run_dir={run_dir}: another process is training in it") from None
         yield
-    except BlockingIOError:
-        raise SettingError(f"run_dir={run_dir}: another process is training in it") from None
     finally:
         os.close(handle)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _disk_errors(run_dir: Path) -> Iterator[None]:
     """Turns a disk that cannot be written into one line."""
     try:
