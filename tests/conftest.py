@@ -20,7 +20,18 @@ def key() -> jax.Array:
     return jax.random.key(0)
 
 
-LONGEST = ("test_resume", "test_run", "test_drivers", "test_envs", "test_adapters")
+LONGEST = (
+    "test_resume",
+    "test_envs",
+    "test_drivers",
+    "test_run",
+    "test_switches",
+    "test_adapters",
+    "test_cli",
+    "test_slbo",
+    "test_planning",
+    "test_layout",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -156,6 +156,12 @@ def run(kind="scan", **changes):
 
 
 @pytest.fixture(scope="module")
+def plain():
+    """The final state of the run in which nothing is switched on."""
+    return run(real_ratio=0.4)[2]
+
+
+@pytest.fixture(scope="module")
 def averaged():
     """Everything switched on, for the two values of τ in one program."""
     return run(
@@ -249,10 +255,9 @@ def test_a_swept_value_is_what_it_is_alone():
     assert max(sharp) > 0.9
 
 
-def test_nothing_changes_where_nothing_is_switched_on():
+def test_nothing_changes_where_nothing_is_switched_on(plain):
     """A switch that is off draws no random number: τ_f so small that no episode is random changes no bit."""
-    _, _, plain, _, _ = run()
-    _, _, barely, _, _ = run(forced_exploration=1e-9)
+    _, _, barely, _, _ = run(real_ratio=0.4, forced_exploration=1e-9)
     jax.tree.map(np.testing.assert_array_equal, plain.seeds.agents.actor, barely.seeds.agents.actor)
 
 
@@ -261,8 +266,7 @@ def test_nothing_changes_where_nothing_is_switched_on():
     [{"real_ratio_schedule": "bandit", "real_ratio_arms": [0.4]}, {"sweep.prior_scale": [0.0]}],
     ids=["a bandit of one arm", "a prior of no weight"],
 )
-def test_a_switch_that_makes_no_difference_changes_no_number(switched):
-    _, _, plain, _, _ = run(real_ratio=0.4)
+def test_a_switch_that_makes_no_difference_changes_no_number(switched, plain):
     _, _, other, _, _ = run(real_ratio=0.4, **switched)
     np.testing.assert_array_equal(plain.seeds.real, other.seeds.real)
     jax.tree.map(
@@ -270,9 +274,8 @@ def test_a_switch_that_makes_no_difference_changes_no_number(switched):
     )
 
 
-def test_averaging_changes_nothing_before_policies_act():
-    warm_up = 120
-    _, _, plain, _, _ = run()
-    _, _, averaged, _, _ = run(posterior="average")
-    np.testing.assert_array_equal(plain.seeds.real[:, :warm_up], averaged.seeds.real[:, :warm_up])
-    assert (plain.seeds.real[:, warm_up:240, 1] != averaged.seeds.real[:, warm_up:240, 1]).any()
+def test_averaging_changes_nothing_before_policies_act(plain, averaged):
+    """The warm-up of the lane without forced exploration."""
+    warm_up, real = 120, averaged[2].seeds.real
+    np.testing.assert_array_equal(plain.seeds.real[0, :warm_up], real[0, :warm_up])
+    assert (plain.seeds.real[0, warm_up:240, 1] != real[0, warm_up:240, 1]).any()
