@@ -39,14 +39,14 @@ class Checkpoints:
     def __init__(self, directory: Path, *, read_only: bool = False):
         self._directory = directory
         self._damaged: list[int] = []
+        for name in ("absl", "orbax"):
+            logging.getLogger(name).setLevel(logging.ERROR)
         options = ocp.CheckpointManagerOptions(
             max_to_keep=KEPT,
             enable_async_checkpointing=False,
             cleanup_tmp_directories=not read_only,  # of a save that was killed
             read_only=read_only,
         )
-        for name in ("absl", "orbax"):
-            logging.getLogger(name).setLevel(logging.ERROR)
         # Measured on 1 GiB of rings: orbax's defaults take 1.9 GiB beside them, these settings 0.1.
         arrays = type_handlers.NumpyHandler(deepcopy_host_arrays=False)
         in_flight: Any = IN_FLIGHT_GB  # typed as int, meant as a number
