@@ -16,7 +16,9 @@ from vecpsmbpo.types import EnvSpec, TrainState
 
 GIB = 2**30
 CHECKPOINT_OVERHEAD = 2**20  # orbax's own files
-PROGRAM_BYTES = 2 * GIB  # Python, JAX and XLA while it compiles (measured: 0.5 and 1.4 GiB)
+# Python, JAX and what XLA takes to compile and keeps (measured: hopper at the paper's size held 6.7 GiB at most, of which
+# 4.2 are announced otherwise; 6.0 where the program came from the compilation cache).
+PROGRAM_BYTES = 11 * GIB // 4
 
 
 def state_bytes(layout: Layout, shapes: Any) -> int:
@@ -87,7 +89,7 @@ def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any)
     free = available_bytes(layout)
     words = f"{state / GIB:.2f} GiB of buffers and networks, {working / GIB:.2f} GiB at work"
     if program:
-        words += f", up to {program / GIB:.0f} GiB for the program itself"
+        words += f", up to {program / GIB:.2f} GiB for the program itself"
     if state + working + program > free:
         raise SettingError(
             f"not enough memory: {words}, but {free / GIB:.2f} GiB are free; lower imagined_capacity, "
