@@ -16,8 +16,8 @@ from vecpsmbpo.types import EnvSpec, TrainState
 
 GIB = 2**30
 CHECKPOINT_OVERHEAD = 2**20  # orbax's own files
-# Python, JAX and what XLA takes to compile and keeps (measured: hopper at the paper's size held 6.7 GiB at most, of which
-# 4.2 are announced otherwise; 6.0 where the program came from the compilation cache).
+# Python, JAX and what XLA takes to compile and keeps (measured: hopper at the paper's size held 6.7 GiB at most, of
+# which 4.2 are announced otherwise; 6.0 where the program came from the compilation cache).
 PROGRAM_BYTES = 11 * GIB // 4
 
 
