@@ -295,9 +295,8 @@ def build(values: Mapping[str, Any]) -> Settings:
     return settings
 
 
-def _contradictions(settings: Settings) -> Iterator[tuple[bool, str]]:
+def _contradictions(one: Settings) -> Iterator[tuple[bool, str]]:
     """Whether settings contradict one another, and how to say so."""
-    one = settings
     yield (
         one.epoch_steps % one.model_update_every != 0,
         f"model_update_every={one.model_update_every}: must divide epoch_steps={one.epoch_steps}",

@@ -4,7 +4,7 @@ import gymnasium
 
 from vecpsmbpo.envs import custom
 from vecpsmbpo.envs.host.batched import HostEnv
-from vecpsmbpo.envs.host.gymnasium import EPISODE_LENGTH, GymnasiumSimulator, batch
+from vecpsmbpo.envs.host.gymnasium import EPISODE_LENGTH, GymnasiumSimulator, batch, layers
 from vecpsmbpo.settings import SettingError
 
 
@@ -22,14 +22,14 @@ def own_task(*, num_envs: int, seed: int, make: str) -> HostEnv:
     if not isinstance(env, gymnasium.Env):
         raise SettingError(f"{label}: gives {type(env).__name__}, not a gymnasium.Env; or backend=mjx")
     rule = getattr(type(env.unwrapped), "termination_rule", None)  # of the class: on the object it would be a method
-    simulators = [GymnasiumSimulator(custom.load(make), seed + index, label) for index in range(num_envs)]
+    every = [env, *(custom.load(make) for _ in range(num_envs - 1))]
+    simulators = [GymnasiumSimulator(each, seed + index, label) for index, each in enumerate(every)]
     return batch(simulators, make.rpartition(":")[2], _limit(env), rule)
 
 
 def _limit(env: gymnasium.Env) -> int:
     """Steps of an episode: of the outermost time limit, or as it is registered."""
-    while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, gymnasium.wrappers.TimeLimit):
-            return env._max_episode_steps
-        env = env.env
-    return (env.spec and env.spec.max_episode_steps) or EPISODE_LENGTH
+    for layer in layers(env):
+        if isinstance(layer, gymnasium.wrappers.TimeLimit):
+            return layer._max_episode_steps
+    return (env.unwrapped.spec and env.unwrapped.spec.max_episode_steps) or EPISODE_LENGTH

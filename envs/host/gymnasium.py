@@ -55,17 +55,9 @@ class GymnasiumSimulator(Simulator):
         return {
             "seed": self._seed,
             "physics": self._state.save() if self._state else None,
-            "attributes": [attributes.save(layer) for layer in self._layers()],
+            "attributes": [attributes.save(layer) for layer in layers(self.env)],
             "generator": core.np_random.bit_generator.state,
         }
-
-    def _layers(self) -> Iterator[Any]:
-        """The environment's wrappers, the outermost first, and itself."""
-        layer = self.env
-        while layer is not self.env.unwrapped:
-            yield layer
-            layer = layer.env
-        yield layer
 
     def load(self, saved: dict[str, Any]) -> None:
         self.env.reset()  # wrappers refuse a step before it
@@ -75,9 +67,17 @@ class GymnasiumSimulator(Simulator):
             action = self._state.load(saved["physics"])
             if action is not None:
                 self.step(action)
-        for layer, values in zip(self._layers(), saved["attributes"], strict=True):
+        for layer, values in zip(layers(self.env), saved["attributes"], strict=True):
             attributes.load(layer, values)
         core.np_random.bit_generator.state = saved["generator"]
+
+
+def layers(env: Any) -> Iterator[Any]:
+    """An environment's wrappers, the outermost first, and itself."""
+    while env is not env.unwrapped:
+        yield env
+        env = env.env
+    yield env
 
 
 def _is_mujoco(core: Any) -> bool:
