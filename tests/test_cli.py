@@ -39,6 +39,8 @@ MISTAKES = [
     (["train", "algo=sac", "n_models=5"], "n_models=5: must be 1 with algo=sac"),
     (["train", "algo=pets", "n_policies=2"], "n_policies=2: must be 1 with algo=pets"),
     (["train", "real_ratio_schedule=linear", "sweep.real_ratio=[0,1]"], "sweep.real_ratio: needs real_ratio_schedule"),
+    (["train", "real_ratio_schedule=bandit", "n_policies=3"], "n_policies=3: must be at least 5"),
+    (["train", "real_ratio_schedule=bandit", "posterior=average"], "posterior=average: leaves nothing to choose"),
     (["train", "validation_ratio=0.3"], "validation_ratio=0.3: must be 1 / k"),
     (["train", "seed=2147483647", "num_seeds=2"], "num_seeds=2: the last seed"),
     (["train", "env=hopper", "imagined_capacity=10"], "imagined_capacity=10: must hold a rollout, of up to 15 steps"),

@@ -83,7 +83,9 @@ def test_a_member_learns_as_a_single_agent_would(reference):
     state = jax.tree.map(lambda x: x[0], seeds.replace(real=seeds.real + noise, imagined=seeds.imagined + row))
     batch_key, update_key = jax.random.split(state.key)
     counters = Counters(jnp.int32(100), jnp.int32(16))
-    batches = learner.minibatches(counters, state, state.imagined[1], jax.random.fold_in(batch_key, 1))
+    batches = learner.minibatches(
+        counters, state, state.imagined[1], settings.real_ratio, jax.random.fold_in(batch_key, 1)
+    )
     agent = jax.tree.map(lambda x: x[1], state.agents)
     nets = sac.make_networks(settings, SPEC)
     single = sac.updates(agent, batches, state.hyper, jax.random.fold_in(update_key, 1), nets=nets)

@@ -63,7 +63,7 @@ def test_policies_learn_from_one_epoch_of_imagined_data(key):
     learner = algorithm(settings, probes.spec(terminates=False))
     state = jax.tree.map(lambda x: x[0], initial(learner))
     ring = jnp.broadcast_to(jnp.arange(128.0)[:, None], state.imagined[0].shape)
-    batches = jax.jit(learner.minibatches)(Counters(jnp.int32(50), jnp.int32(128 + 16)), state, ring, key)
+    batches = jax.jit(learner.minibatches)(Counters(jnp.int32(50), jnp.int32(128 + 16)), state, ring, 0.0, key)
     assert set(np.unique(batches.reward)) == {*range(16), *range(112, 128)}
 
 
@@ -75,7 +75,7 @@ def test_each_row_of_a_minibatch_is_real_with_probability_lambda(key, real_ratio
     state = jax.tree.map(lambda x: x[0], initial(learner))
     state = state.replace(real=jnp.ones_like(state.real))
     counters = Counters(jnp.int32(50), jnp.int32(16))
-    batches = jax.jit(learner.minibatches)(counters, state, 2 * jnp.ones_like(state.imagined[0]), key)
+    batches = jax.jit(learner.minibatches)(counters, state, 2 * jnp.ones_like(state.imagined[0]), real_ratio, key)
     real = np.asarray(batches.reward) == 1.0
     assert set(np.unique(batches.reward)) <= {1.0, 2.0}
     assert scipy.stats.binomtest(int(real.sum()), real.size, real_ratio).pvalue > 1e-3

@@ -1,12 +1,12 @@
 """The paper's ablations: every switch changes what it should and nothing else."""
 
-import dataclasses
 import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.stats
 
 from tests import probes
@@ -72,7 +72,7 @@ def test_of_a_run_s_updates_the_linear_schedule_uses_as_many_real_rows_as_the_co
         real_ratio_schedule="linear", real_ratio=mean, total_steps=12_000, warmup_steps=4_000, replay_capacity=5000
     )
     hyper, steps = Hyper.of(settings), jnp.arange(settings.first_learning_step, settings.total_steps)
-    ratios = jax.vmap(lambda t: mixture.real_ratio(settings, hyper, None, t))(steps)
+    ratios = jax.vmap(lambda t: mixture.real_ratios(settings, hyper, t)[0])(steps)
     assert float(ratios.mean()) == pytest.approx(mean, abs=1e-3)
     assert float(ratios[0]) == 1
 
@@ -82,63 +82,91 @@ def test_the_linear_schedule_of_no_or_only_real_data_is_constant(mean):
     np.testing.assert_allclose(mixture.linear(jnp.float32(mean), jnp.array([0.01, 0.5, 0.99])), mean)
 
 
-def _bandit(settings, **changes):
-    return mixture.init(settings, jax.random.key(0)).replace(**changes)
+ARMS = (0.0, 0.1, 0.3, 0.5)
 
 
-def test_exp3s_by_hand():
-    """K = 4 arms, T = 200 rounds, weights 1, arm 2 gains 0.75."""
-    settings = dataclasses.replace(tiny(), total_steps=8040, real_ratio_arms=(0.0, 0.1, 0.3, 0.5))  # 40 are warm-up
-    explored = math.sqrt(4 * (2 * math.log(800) + math.e) / ((math.e - 1) * 200))
-    assert mixture.rates(settings) == (pytest.approx(explored), 0.005)
-    grown = np.ones(4)
-    grown[2] = math.exp(explored * (0.75 / 0.25) / 4)
-    weights = grown + math.e * 0.005 / 4 * 4
-    bandit = _bandit(settings, arm=jnp.int32(2))
-    learned = mixture.reinforce(bandit, settings, jnp.float32(0.75))
-    np.testing.assert_allclose(np.exp(learned), weights / weights.max(), rtol=1e-5)
-    probs = mixture.probabilities(bandit.replace(log_weights=learned), settings)
-    np.testing.assert_allclose(probs, (1 - explored) * weights / weights.sum() + explored / 4, rtol=1e-5)
+def _bandit(returns, counts, *, lowest=0.0, highest=1.0, rounds=10):
+    numbers = (jnp.asarray(x, jnp.float32) for x in (returns, counts))
+    return Bandit(*numbers, jnp.int32(rounds), jnp.float32(lowest), jnp.float32(highest))
 
 
-def test_short_runs_do_not_only_explore():
-    settings = dataclasses.replace(tiny(), total_steps=400, real_ratio_arms=(0.0, 0.1, 0.3, 0.5))
-    bandit = _bandit(settings, log_weights=jnp.array([0.0, -20.0, -20.0, -20.0]))
-    np.testing.assert_allclose(mixture.probabilities(bandit, settings), [0.625, 0.125, 0.125, 0.125], atol=1e-6)
+def test_policy_m_learns_with_arm_m_mod_k():
+    settings = tiny(n_policies=5, real_ratio_schedule="bandit", real_ratio_arms=list(ARMS))
+    np.testing.assert_allclose(mixture.real_ratios(settings, Hyper.of(settings), 0), [0.0, 0.1, 0.3, 0.5, 0.0])
+    constant = tiny(n_policies=2, real_ratio=0.4)
+    np.testing.assert_allclose(mixture.real_ratios(constant, Hyper.of(constant), 0), [0.4, 0.4])
 
 
-def test_an_arm_gains_by_improving_the_return():
-    settings = dataclasses.replace(tiny(), total_steps=4000)
-    first = _bandit(settings, arm=jnp.int32(1))
-    for episode_return in (0.0, 50.0):  # nothing to compare with yet, and no scale
-        first = mixture.end_round(first, settings, jnp.float32(episode_return), jax.random.key(1))
-        np.testing.assert_array_equal(first.log_weights, 0)
-    for episode_return, sign in ((80.0, 1), (20.0, -1)):
-        second = mixture.end_round(
-            first.replace(arm=jnp.int32(3)), settings, jnp.float32(episode_return), jax.random.key(2)
-        )
-        neutral = mixture.reinforce(first.replace(arm=jnp.int32(3)), settings, jnp.float32(0.5))
-        lead = second.log_weights[3] - second.log_weights[0]
-        assert np.sign(lead - (neutral[3] - neutral[0])) == sign
+def test_an_episode_is_credited_to_its_arm_and_older_ones_are_discounted():
+    bandit, yes, no = (
+        mixture.init(tiny(real_ratio_schedule="bandit", real_ratio_arms=list(ARMS), n_policies=4)),
+        jnp.bool_(True),
+        jnp.bool_(False),
+    )
+    np.testing.assert_allclose(mixture.probabilities(bandit), 0.25, rtol=1e-5)
+    bandit = mixture.credit(bandit, 3, -20.0, done=yes, counts=no)  # a random episode: the range only
+    bandit = mixture.credit(bandit, 1, 60.0, done=yes, counts=yes)
+    bandit = mixture.credit(bandit, 2, 1e6, done=no, counts=no)  # runs on
+    bandit = mixture.credit(bandit, 2, 20.0, done=yes, counts=yes)
+    left = 1 - 1 / (8 * math.sqrt(2))
+    wins, losses = mixture.beliefs(bandit)
+    np.testing.assert_allclose(wins, [1, 1 + left, 1.5, 1], rtol=1e-6)  # 60 is the best of -20 to 60, 20 half way
+    np.testing.assert_allclose(losses, [1, 1, 1.5, 1], rtol=1e-6)
+
+
+def test_before_the_first_success_arms_take_turns():
+    bandit = mixture.init(tiny(real_ratio_schedule="bandit", real_ratio_arms=list(ARMS), n_policies=4))
+    for arm in (0, 1, 1):
+        bandit = mixture.credit(bandit, arm, 0.0, done=jnp.bool_(True), counts=jnp.bool_(True))
+    probs = mixture.probabilities(bandit)
+    assert probs[1] < probs[0] < probs[2] == pytest.approx(float(probs[3]))
+
+
+def test_the_probability_to_be_the_best_in_closed_form():
+    """Of X ~ Beta(a, 1) and Y ~ Beta(c, 1), X is the larger with probability a / (a + c)."""
+    probs = mixture.probabilities(_bandit([4.0, 1.5], [4.0, 1.5]))
+    np.testing.assert_allclose(probs, [5 / 7.5, 2.5 / 7.5], atol=1e-4)
+
+
+@pytest.mark.parametrize("scale", [1, 10, 200])
+def test_the_probability_to_be_the_best_by_quadrature(scale):
+    gains, counts = scale * np.array([0.9, 0.5, 0.7]), scale * np.array([1.0, 1.1, 0.95])
+    laws = [scipy.stats.beta(1 + g, 1 + c - g) for g, c in zip(gains, counts, strict=True)]
+
+    def density(x, arm):
+        return laws[arm].pdf(x) * math.prod(law.cdf(x) for i, law in enumerate(laws) if i != arm)
+
+    points = [law.mean() for law in laws]
+    exact = [scipy.integrate.quad(density, 0, 1, args=(arm,), points=points, limit=500)[0] for arm in range(3)]
+    np.testing.assert_allclose(mixture.probabilities(_bandit(gains, counts)), exact, atol=2e-4)
+
+
+def test_an_arm_is_drawn_first_and_then_one_of_its_members():
+    """N = 2, M = 3, two arms: policies 0 and 2 of each model have arm 0."""
+    settings = tiny(n_models=2, n_policies=3, real_ratio_schedule="bandit", real_ratio_arms=[0.0, 0.5])
+    bandit, scores = _bandit([2.0, 0.5], [3.0, 3.0]), jnp.log(jnp.array([1.0, 3.0, 2.0, 4.0, 5.0, 3.0]))
+    probs = jax.nn.softmax(mixture.by_arm(bandit, settings, scores))
+    first, second = np.asarray(mixture.probabilities(bandit))
+    expected = first * np.array([1, 0, 2, 4, 0, 3]) / 10 + second * np.array([0, 3, 0, 0, 5, 0]) / 8
+    np.testing.assert_allclose(probs, expected, rtol=1e-5)
 
 
 def test_the_bandit_follows_the_best_arm_when_it_changes():
-    """2,000 rounds; arm 0 gains 0.9 in the first half and arm 3 in the second, the others 0.1."""
-    settings = dataclasses.replace(tiny(), total_steps=2000 * 40, real_ratio_arms=(0.0, 0.1, 0.3, 0.5))
+    """400 rounds; arm 0 gains 0.9 in the first half and arm 3 in the second, the others 0.1."""
 
     def round_(bandit: Bandit, xs):
         best, key = xs
-        probs = mixture.probabilities(bandit, settings)
-        arm = jax.random.categorical(key, jnp.log(probs))
+        arm = jax.random.categorical(key, jnp.log(mixture.probabilities(bandit)))
         gain = jnp.where(arm == best, 0.9, 0.1)
-        bandit = bandit.replace(arm=arm)
-        return bandit.replace(log_weights=mixture.reinforce(bandit, settings, gain)), gain
+        return mixture.credit(bandit, arm, gain, jnp.bool_(True), jnp.bool_(True)), gain
 
-    best = jnp.where(jnp.arange(2000) < 1000, 0, 3)
-    _, gains = jax.lax.scan(round_, _bandit(settings), (best, jax.random.split(jax.random.key(0), 2000)))
+    best = jnp.where(jnp.arange(400) < 200, 0, 3)
+    _, gains = jax.lax.scan(
+        round_, _bandit(jnp.zeros(4), jnp.zeros(4)), (best, jax.random.split(jax.random.key(0), 400))
+    )
     gains = np.asarray(gains)
-    assert gains[500:1000].mean() > 0.6  # a uniform choice would have 0.3
-    assert gains[1500:].mean() > 0.6
+    assert gains[100:200].mean() > 0.7  # a uniform choice would have 0.3
+    assert gains[300:].mean() > 0.7
 
 
 # ── all of them in a run ─────────────────────────────────────────────────────────────────────────────────────────
@@ -163,12 +191,22 @@ def plain():
 
 @pytest.fixture(scope="module")
 def averaged():
-    """Everything switched on, for the two values of τ in one program."""
+    """All switches that go together, for two values of τ in one program."""
+    return run(posterior="average", prior_scale=0.3, real_ratio=0.4, **{"sweep.forced_exploration": [0.0, 60.0]})
+
+
+RATIOS = [0.3, 0.9]
+EXPLORATION = [0.0, 1e9]  # τ: none, and all episodes random
+
+
+@pytest.fixture(scope="module")
+def adapted():
+    """λ chosen online, one policy of each model with either."""
     return run(
-        posterior="average",
-        prior_scale=0.3,
         real_ratio_schedule="bandit",
-        **{"sweep.forced_exploration": [0.0, 60.0]},
+        real_ratio_arms=RATIOS,
+        temperature=1.0,
+        **{"sweep.forced_exploration": EXPLORATION},
     )
 
 
@@ -195,13 +233,55 @@ def test_swept_values_run_side_by_side(averaged):
     assert abs(count - chances.sum()) < 4 * np.sqrt((chances * (1 - chances)).sum())
 
 
-def test_the_bandit_s_choices_are_logged(averaged):
-    settings, _, _, _, epochs = averaged
-    chosen = [line["real_ratio"] for line in epochs]
-    assert set(np.round(chosen, 6)) <= set(settings.real_ratio_arms)
-    assert len(set(chosen)) > 1
-    np.testing.assert_allclose([sum(line["real_ratio_probs"]) for line in epochs], 1, rtol=1e-5)
-    assert len(epochs[0]["real_ratio_probs"]) == len(settings.real_ratio_arms)
+def test_each_policy_learns_with_its_own_ratio(adapted):
+    """Where all episodes are random, runs with different λ see the same data: policy m of the bandit's run is policy m
+    of the run with the constant λ of its arm."""
+    constants = run(forced_exploration=EXPLORATION[1], **{"sweep.real_ratio": RATIOS})[2].seeds.agents.actor
+    settings, _, state, _, _ = adapted
+    for member in range(settings.n_members):
+        ours = jax.tree.map(lambda x, member=member: x[1, member], state.seeds.agents.actor)
+        for lane in range(2):
+            theirs = jax.tree.map(lambda x, lane=lane, member=member: x[lane, member], constants)
+            same = jax.tree.map(lambda a, b: np.allclose(a, b, atol=1e-5), ours, theirs)
+            assert all(jax.tree.leaves(same)) == (lane == member % 2)
+
+
+def test_who_acts_can_be_recomputed_from_the_log(adapted):
+    """Arms from the discounted gains of earlier episodes, members among them by equation 19."""
+    settings, _, _, lines, epochs = adapted
+    gains = {0: [], 1: []}  # return and the rounds after it that discount it
+    seen, earned, rounds = [], np.zeros((settings.n_models, 2)), 0
+
+    def arm_probabilities():
+        low, high = (min(seen), max(seen)) if seen else (0.0, 0.0)
+        laws = []
+        for arm in (0, 1):
+            weights = np.array(
+                [math.prod(1 - 1 / (8 * math.sqrt(r)) for r in range(since + 1, rounds + 1)) for _, since in gains[arm]]
+            )
+            wins = np.array([(value - low) / max(high - low, 1e-6) for value, _ in gains[arm]])
+            laws.append(
+                scipy.stats.beta(1 + weights @ wins, 1 + weights @ (1 - wins)) if gains[arm] else scipy.stats.beta(1, 1)
+            )
+        first = scipy.integrate.quad(lambda x: laws[0].pdf(x) * laws[1].cdf(x), 0, 1, limit=200)[0]
+        return np.array([first, 1 - first])
+
+    checked = 0
+    for line in (line for line in lines if line["forced_exploration"] == 0.0):
+        if line["episode"] % 10 == 1 or line["episode"] > 100:
+            within = np.exp(earned - earned.max(axis=0))
+            expected = arm_probabilities() * within / within.sum(axis=0)
+            np.testing.assert_allclose(line["probs"], expected, atol=1e-3)
+            checked += not line["random"]
+        seen.append(line["return"])
+        if not line["random"]:
+            rounds += 1
+            gains[line["policy"]].append((line["return"], rounds))
+            earned[line["model"], line["policy"]] += line["return"]
+    assert checked > 10
+    last = [line for line in epochs if line["forced_exploration"] == 0.0][-1]
+    np.testing.assert_allclose(last["real_ratio_probs"], arm_probabilities(), atol=1e-3)
+    assert last["real_ratio"] == pytest.approx(float(np.dot(last["real_ratio_probs"], RATIOS)), rel=1e-5)
 
 
 def test_priors_stay_as_they_were_drawn(averaged):

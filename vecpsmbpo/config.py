@@ -228,7 +228,7 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None) -> Setting
         had = dict(getattr(stored, _DOTTED[group])).get(option) if group else getattr(stored, name)
         if name == "run_dir" or value == had or (name, value) == ("backend", "auto"):
             continue
-        if name not in CHANGEABLE or (name == "total_steps" and stored.real_ratio_schedule != "constant"):
+        if name not in CHANGEABLE or (name == "total_steps" and stored.real_ratio_schedule == "linear"):
             raise SettingError(
                 f"{name}={value}: contradicts the run in {run_dir}, which has {name}={had}; "
                 "leave it out to resume, or give another run_dir"

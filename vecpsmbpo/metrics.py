@@ -121,9 +121,10 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     updates = stats.pop("updates")
     env_steps = int(state.counters.env_steps)
     fitted = np.asarray(seeds.models.optimizer.count)[:, 0] > 0
-    ratios = jax.vmap(lambda hyper, bandit: mixture.real_ratio(settings, hyper, bandit, state.counters.env_steps))(
-        seeds.hyper, seeds.bandit
-    )
+    ratios = jax.vmap(lambda hyper: mixture.real_ratios(settings, hyper, state.counters.env_steps)[0])(seeds.hyper)
+    if seeds.bandit is not None:
+        arms = np.asarray(jax.vmap(mixture.probabilities)(seeds.bandit))
+        ratios = arms @ np.asarray(settings.real_ratio_arms)  # the mean λ of who acts next
     lines = []
     for seed in range(len(settings.lanes)):
         episodes = float(seeds.epoch_episodes[seed])
@@ -146,8 +147,7 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
             }
         )
         if seeds.bandit is not None:
-            bandit = jax.tree.map(lambda x, seed=seed: x[seed], seeds.bandit)
-            lines[-1]["real_ratio_probs"] = mixture.probabilities(bandit, settings).tolist()
+            lines[-1]["real_ratio_probs"] = arms[seed].tolist()
     return lines
 
 

@@ -1,7 +1,5 @@
 """λ, the share of real data in what policies learn from: constant, falling, or chosen by a bandit (B.3)."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 
@@ -9,15 +7,16 @@ from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Bandit, Hyper
 
 
-def real_ratio(settings: Settings, hyper: Hyper, bandit: Bandit | None, env_steps: jax.Array) -> jax.Array:
-    """λ now, []."""
+def real_ratios(settings: Settings, hyper: Hyper, env_steps: jax.Array) -> jax.Array:
+    """[M] the λ with which policies m = 0, 1, ... of every model learn now."""
+    if settings.adapts_real_ratio:
+        return jnp.asarray(settings.real_ratio_arms)[arm_of(settings, jnp.arange(settings.n_policies))]
+    ratio = hyper.real_ratio
     if settings.real_ratio_schedule == "linear":
         # Of the steps that learn, so that as many real rows are used as with the constant.
         learning = max(settings.total_steps - settings.first_learning_step, 1)
-        return linear(hyper.real_ratio, jnp.maximum(env_steps - settings.first_learning_step, 0) / learning)
-    if bandit is not None:
-        return jnp.asarray(settings.real_ratio_arms)[bandit.arm]
-    return hyper.real_ratio
+        ratio = linear(ratio, jnp.maximum(env_steps - settings.first_learning_step, 0) / learning)
+    return jnp.broadcast_to(ratio, (settings.n_policies,))
 
 
 def linear(mean: jax.Array, progress: jax.Array) -> jax.Array:
@@ -33,75 +32,89 @@ def linear(mean: jax.Array, progress: jax.Array) -> jax.Array:
     return jnp.clip(1 - (progress - start) / jnp.maximum(length, 1e-6), 0.0, 1.0)
 
 
-# ── the bandit: Exp3.S (Auer, Cesa-Bianchi, Freund and Schapire, 2002, section 8) ────────────────────────────────
+# ── the bandit: discounted Thompson sampling (Raj and Kalyani, 2017; regret: Qi, Guo and Zhu, 2025) ──────────────
 #
-# An arm is a value of λ, a round is an epoch, and what an arm gains is how much the return improved while it was in
-# force. What the best λ is changes while models and policies learn, so that a rule which competes with the best single
-# arm in hindsight (explore-then-commit, UCB, Exp3) competes with the wrong thing; and gains depend on everything that
-# was done before, so that nothing may be assumed of their distribution. Exp3.S needs no such assumption and has no
-# regret against the best sequence of arms with few changes: no weight ever falls so low that its arm could not return.
+# An arm is a value of λ, and policy m of every model learns with arm m mod K throughout: what one arm does to a critic
+# is its own, all arms learn from the same real data D_E, and where there are M >= K policies anyhow this costs nothing.
+# A round is an episode: an arm is drawn, and the member that acts among those of the arm by equation 18 or 19. It gains
+# the episode's return. (The other way, all policies changing λ together every epoch, was tried: one epoch of a bad λ
+# spoils all critics, and the blame falls on the arm after it; docs/results.md.)
+#
+# What an arm is worth changes while it learns, so that a rule which competes with the best single arm in hindsight
+# (explore-then-commit, UCB, Exp3) competes with the wrong thing. Exp3.S and its kin follow changes whatever causes
+# them, but are made for an opponent who knows the algorithm, and need hundreds of rounds where runs have tens to
+# hundreds of episodes. Thompson sampling is the paper's own principle one level up. Discounting forgets what policies
+# earned when they knew less; with it, regret against the best arm of every moment is within logarithms of optimal for
+# arms that jump, and sublinear for arms that drift.
+
+GRID = 512
 
 
-HARDNESS = 2  # 1 + the number of changes of the best arm that are reckoned with
-MOST_EXPLORED = 0.5
+def arm_of(settings: Settings, member: jax.Array) -> jax.Array:
+    """The arm of member n·M + m."""
+    return member % settings.n_policies % len(settings.real_ratio_arms)
 
 
-def init(settings: Settings, key: jax.Array) -> Bandit:
-    """Equal weights, and a first arm."""
-    count = len(settings.real_ratio_arms)
-    nothing = jnp.zeros(())
-    return Bandit(jnp.zeros(count), jax.random.randint(key, (), 0, count), jnp.int32(0), nothing, nothing, nothing)
+def init(settings: Settings) -> Bandit:
+    """Nothing is known: arms are equally likely."""
+    nothing, most = jnp.zeros(len(settings.real_ratio_arms)), jnp.float32(1e30)
+    return Bandit(returns=nothing, counts=nothing, rounds=jnp.int32(0), lowest=most, highest=-most)
 
 
-def rates(settings: Settings) -> tuple[float, float]:
-    """γ, how much is explored, and α, how much weight is shared: those that bound the regret against the best sequence
-    with one change of arms (hardness S = 2).
+def discount(rounds: jax.Array) -> jax.Array:
+    """What of earlier rounds is left after one more: 1 - 1 / (8 √rounds).
 
-    Below some hundred rounds that γ nears 1, at which no gain would count (and the bound promises nothing). So short
-    runs explore half of the time.
+    The order is that of the optimum for few changes (Garivier and Moulines, 2011, who take 1 / 4); rounds so far stand
+    for their total, which nobody knows before episodes end. Arms that drift as policies do are followed better with
+    twice that memory.
     """
-    arms, learning = len(settings.real_ratio_arms), settings.total_steps - settings.first_learning_step
-    rounds = max(learning // settings.epoch_steps, 1)
-    explored = math.sqrt(arms * (HARDNESS * math.log(arms * rounds) + math.e) / ((math.e - 1) * rounds))
-    return min(MOST_EXPLORED, explored), 1 / rounds
+    return 1 - 1 / (8 * jnp.sqrt(jnp.maximum(rounds, 1)))
 
 
-def probabilities(bandit: Bandit, settings: Settings) -> jax.Array:
-    """[K] the distribution that the next arm is drawn from."""
-    explored, _ = rates(settings)
-    return (1 - explored) * jax.nn.softmax(bandit.log_weights) + explored / bandit.log_weights.shape[0]
-
-
-def end_round(bandit: Bandit, settings: Settings, episode_return: jax.Array, key: jax.Array) -> Bandit:
-    """Rewards the arm in force with the epoch's mean return, and draws the next one.
-
-    The gain lies in [0, 1]: 1/2 plus half the change since the epoch before, in units of the range of all epochs' mean
-    returns so far. The first epoch has nothing to be compared with, and the second no scale: its change is the range.
-    """
-    first = bandit.rounds == 0
-    lowest = jnp.where(first, episode_return, jnp.minimum(bandit.lowest, episode_return))
-    highest = jnp.where(first, episode_return, jnp.maximum(bandit.highest, episode_return))
-    change = (episode_return - bandit.previous) / jnp.maximum(highest - lowest, 1e-6)
-    weights = reinforce(bandit, settings, 0.5 + 0.5 * jnp.clip(change, -1.0, 1.0))
-    bandit = bandit.replace(
-        log_weights=jnp.where(bandit.rounds >= 2, weights, bandit.log_weights),
-        rounds=bandit.rounds + 1,
-        previous=episode_return,
-        lowest=lowest,
-        highest=highest,
+def credit(bandit: Bandit, arm: jax.Array, episode_return: jax.Array, done: jax.Array, counts: jax.Array) -> Bandit:
+    """Adds the return of an episode that is `done` to its arm where it `counts`. Random episodes set the scale only."""
+    rounds = bandit.rounds + counts
+    kept = jnp.where(counts, discount(rounds), 1.0)
+    one = counts * jax.nn.one_hot(arm, bandit.counts.shape[0])
+    return Bandit(
+        returns=kept * bandit.returns + one * episode_return,
+        counts=kept * bandit.counts + one,
+        rounds=rounds,
+        lowest=jnp.where(done, jnp.minimum(bandit.lowest, episode_return), bandit.lowest),
+        highest=jnp.where(done, jnp.maximum(bandit.highest, episode_return), bandit.highest),
     )
-    return bandit.replace(arm=jax.random.categorical(key, jnp.log(probabilities(bandit, settings))))
 
 
-def reinforce(bandit: Bandit, settings: Settings, gain: jax.Array) -> jax.Array:
-    """[K] the logarithms of w_i exp(γ x̂_i / K) + (e α / K) Σ w, where x̂ is the gain of the arm over its probability.
+def beliefs(bandit: Bandit) -> tuple[jax.Array, jax.Array]:
+    """[K] each: the parameters of the Beta distribution of what each arm gains, uniform at first.
 
-    The largest is 0: only their ratios matter.
+    A gain is where the return lies in the range of all returns so far, from 0 to 1; a gain of 0.3 is 0.3 successes and
+    0.7 failures. While all returns are equal, as before the first success of a sparse task, all gains are 0: arms that
+    were tried less are tried next.
     """
-    explored, shared = rates(settings)
-    weights, count = bandit.log_weights, bandit.log_weights.shape[0]
-    estimate = gain / probabilities(bandit, settings)[bandit.arm]
-    grown = weights.at[bandit.arm].add(explored * estimate / count)
-    share = jax.nn.logsumexp(weights) + 1 + math.log(shared / count)
-    mixed = jnp.logaddexp(grown, share)
-    return mixed - jnp.max(mixed)
+    span = jnp.maximum(bandit.highest - bandit.lowest, 1e-6)
+    gains = jnp.clip((bandit.returns - bandit.counts * bandit.lowest) / span, 0.0, bandit.counts)
+    return 1 + gains, 1 + bandit.counts - gains
+
+
+def probabilities(bandit: Bandit) -> jax.Array:
+    """[K] how likely each arm is the best, ∫ p_i(x) Π_{j ≠ i} P(x_j < x) dx: the distribution that Thompson sampling
+    draws from, by the midpoint rule.
+
+    It could be drawn from without being known, but who acts is drawn once, from a distribution that is logged.
+    """
+    wins, losses = beliefs(bandit)
+    x = (jnp.arange(GRID) + 0.5) / GRID
+    mass = jax.nn.softmax((wins - 1)[:, None] * jnp.log(x) + (losses - 1)[:, None] * jnp.log1p(-x), axis=1)
+    below = jnp.cumsum(mass, axis=1) - mass / 2
+    itself = jnp.eye(mass.shape[0], dtype=bool)[:, :, None]
+    best = jnp.sum(mass * jnp.prod(jnp.where(itself, 1.0, below), axis=1), axis=1)
+    return best / jnp.sum(best)
+
+
+def by_arm(bandit: Bandit, settings: Settings, logits: jax.Array) -> jax.Array:
+    """[N·M] logits of drawing an arm and then, by the `logits` given, one of its members."""
+    arm = arm_of(settings, jnp.arange(settings.n_members))
+    arms = jnp.arange(bandit.counts.shape[0])
+    of_arm = jax.nn.logsumexp(jnp.where(arms[:, None] == arm, logits, -jnp.inf), axis=1)
+    return logits - of_arm[arm] + jnp.log(probabilities(bandit))[arm]

@@ -343,6 +343,15 @@ def _contradictions(one: Settings) -> Iterator[tuple[bool, str]]:
         (one.alternates or one.plans) and one.posterior == "average",
         f"posterior=average: there are no policies to average with {name}",
     )
+    yield (
+        one.adapts_real_ratio and one.n_policies < len(one.real_ratio_arms),
+        f"n_policies={one.n_policies}: must be at least {len(one.real_ratio_arms)}, one for each of real_ratio_arms, "
+        "with real_ratio_schedule=bandit",
+    )
+    yield (
+        one.adapts_real_ratio and one.posterior == "average",
+        "posterior=average: leaves nothing to choose for real_ratio_schedule=bandit",
+    )
     yield one.plan_elites > one.plan_population, f"plan_elites={one.plan_elites}: must be at most plan_population"
     yield (
         one.plans and one.plan_particles % one.n_models != 0,

@@ -163,19 +163,17 @@ class Posterior(struct.PyTreeNode):
 
 
 class Bandit(struct.PyTreeNode):
-    """What the choice of λ has learned (`mixture`), K arms.
+    """What is known of the K values of λ to choose from (`mixture`).
 
     Attributes:
-        log_weights: [K].
-        arm: [] int, in force.
-        rounds: [] int, epochs so far.
-        previous, lowest, highest: [], mean returns: of the epoch before, and of all so far.
+        returns, counts: [K], sum and number of the returns of each arm's episodes, older ones discounted.
+        rounds: [] int, episodes so far.
+        lowest, highest: [], returns of all finished episodes, random ones too; ±1e30 where there is none.
     """
 
-    log_weights: jax.Array
-    arm: jax.Array
+    returns: jax.Array
+    counts: jax.Array
     rounds: jax.Array
-    previous: jax.Array
     lowest: jax.Array
     highest: jax.Array
 

@@ -16,7 +16,18 @@ import numpy as np
 from vecpsmbpo import dynamics, imagination, mixture, posterior, replay
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import Counters, EnvSpec, Episode, EpisodeEnd, Hyper, Moments, SeedState, Transition
+from vecpsmbpo.types import (
+    Bandit,
+    Counters,
+    EnvSpec,
+    Episode,
+    EpisodeEnd,
+    Hyper,
+    Moments,
+    Posterior,
+    SeedState,
+    Transition,
+)
 
 
 @dataclass(frozen=True)
@@ -75,6 +86,7 @@ class Algorithm(ABC):
         settings, spec, layout = self.settings, self.spec, self.layout
         key, model_key, agent_key, draw_key = jax.random.split(key, 4)
         members = posterior.init(settings.n_members)
+        bandit = mixture.init(settings) if settings.adapts_real_ratio else None
         size = spec.obs_size + spec.action_size
         ring = replay.init(imagination.ring_capacity(settings), spec.obs_size, spec.action_size)
         return SeedState(
@@ -88,9 +100,9 @@ class Algorithm(ABC):
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
             moments=Moments(jnp.zeros(size + spec.obs_size), jnp.zeros(size + spec.obs_size), inputs=size),
             posterior=members,
-            episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
+            episode=self._begin_episode(members, bandit, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
             memory=self.memory(),
-            bandit=mixture.init(settings, jax.random.fold_in(draw_key, 2)) if settings.adapts_real_ratio else None,
+            bandit=bandit,
             epoch_return=jnp.zeros(()),
             epoch_episodes=jnp.zeros(()),
         )
@@ -118,7 +130,7 @@ class Algorithm(ABC):
         key: jax.Array,
     ) -> tuple[SeedState, EpisodeEnd]:
         """Stores a real transition; where it ends the episode, credits the member and draws the next one."""
-        episode = state.episode
+        episode, bandit = state.episode, state.bandit
         total = episode.episode_return + transition.reward
         length = episode.length + 1
         terminated = transition.terminated > 0
@@ -133,9 +145,12 @@ class Algorithm(ABC):
             length=length,
             probs=episode.probs,
         )
-        members = posterior.credit(state.posterior, episode.member, total, done & ~episode.random)
+        counts = done & ~episode.random
+        members = posterior.credit(state.posterior, episode.member, total, counts)
+        if bandit is not None:
+            bandit = mixture.credit(bandit, mixture.arm_of(self.settings, episode.member), total, done, counts)
         random = counters.env_steps + 1 < self.settings.warmup_steps
-        following = self._begin_episode(members, state.hyper, episode.index + 1, random, key)
+        following = self._begin_episode(members, bandit, state.hyper, episode.index + 1, random, key)
         running = episode.replace(episode_return=total, length=length)
         state = state.replace(
             real=replay.add(state.real, replay.pack(transition)[None], counters.env_steps),
@@ -143,13 +158,24 @@ class Algorithm(ABC):
             posterior=members,
             episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
             memory=jax.tree.map(partial(jnp.where, done), self.memory(), state.memory),
+            bandit=bandit,
             epoch_return=state.epoch_return + jnp.where(done, total, 0.0),
             epoch_episodes=state.epoch_episodes + done,
         )
         return state, end
 
-    def _begin_episode(self, members, hyper: Hyper, index, random, key: jax.Array) -> Episode:
-        member, probs = posterior.draw(members, hyper.temperature, key)
+    def draw_member(
+        self, members: Posterior, bandit: Bandit | None, hyper: Hyper, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """The member that acts next, [] int, and the distribution [N·M] that it was drawn from: that of equation 18 or
+        19, among the members of an arm that the bandit chooses, if there is one."""
+        logits = posterior.logits(members, hyper.temperature)
+        if bandit is not None:
+            logits = mixture.by_arm(bandit, self.settings, logits)
+        return posterior.draw(logits, key)
+
+    def _begin_episode(self, members, bandit, hyper: Hyper, index, random, key: jax.Array) -> Episode:
+        member, probs = self.draw_member(members, bandit, hyper, key)
         if self.settings.posterior == "average":
             member = jnp.int32(-1)
         explores = posterior.exploration_probability(hyper.forced_exploration, index)
@@ -159,19 +185,13 @@ class Algorithm(ABC):
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
-    def real_ratio(self, counters: Counters, state: SeedState) -> jax.Array:
-        """λ now, []."""
-        return mixture.real_ratio(self.settings, state.hyper, state.bandit, counters.env_steps)
+    def real_ratios(self, counters: Counters, state: SeedState) -> jax.Array:
+        """[M] the λ of every model's policies now."""
+        return mixture.real_ratios(self.settings, state.hyper, counters.env_steps)
 
-    def begin_epoch(self, counters: Counters, state: SeedState, key: jax.Array) -> SeedState:
-        """Clears the epoch's sums when an epoch begins, and lets the bandit, if there is one, draw λ anew."""
-        settings = self.settings
-        fresh = counters.env_steps % settings.epoch_steps == 0
-        if state.bandit is not None:
-            counts = fresh & (counters.env_steps > settings.first_learning_step) & (state.epoch_episodes > 0)
-            mean_return = state.epoch_return / jnp.maximum(state.epoch_episodes, 1)
-            drawn = mixture.end_round(state.bandit, settings, mean_return, key)
-            state = state.replace(bandit=jax.tree.map(partial(jnp.where, counts), drawn, state.bandit))
+    def begin_epoch(self, counters: Counters, state: SeedState) -> SeedState:
+        """Clears the epoch's sums when an epoch begins."""
+        fresh = counters.env_steps % self.settings.epoch_steps == 0
 
         def cleared(tree):
             return jax.tree.map(lambda x: jnp.where(fresh, jnp.zeros_like(x), x), tree)

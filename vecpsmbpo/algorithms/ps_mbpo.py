@@ -39,7 +39,7 @@ class PsMbpo(Algorithm):
         if self.settings.eval_policy == "best":
             member = posterior.best(state.posterior)
         else:
-            member, _ = posterior.draw(state.posterior, state.hyper.temperature, key)
+            member, _ = self.draw_member(state.posterior, state.bandit, state.hyper, key)
         return self.layout.ask(member, state.agents.actor)
 
     def evaluation_action(
@@ -144,10 +144,11 @@ class PsMbpo(Algorithm):
         layout, nets = self.layout, sac.make_networks(self.settings, self.spec)
         batch_key, update_key = jax.random.split(key)
         ids = layout.member_ids()
+        ratios = self.real_ratios(counters, state)[ids % self.settings.n_policies]
         # Minibatches of all members are gathered at once and before the loop over members: looping over the rings
         # themselves would copy each of them whole.
-        batches = jax.vmap(lambda imagined, key: self.minibatches(counters, state, imagined, key))(
-            state.imagined, layout.keys(batch_key, ids)
+        batches = jax.vmap(lambda imagined, ratio, key: self.minibatches(counters, state, imagined, ratio, key))(
+            state.imagined, ratios, layout.keys(batch_key, ids)
         )
 
         def update(agent, batches, key):
@@ -163,8 +164,10 @@ class PsMbpo(Algorithm):
         rows = imagination.rows_per_refresh(settings, jnp.asarray(refreshes))
         return updates, int(np.sum(rows)) * settings.n_members
 
-    def minibatches(self, counters: Counters, state: SeedState, imagined: jax.Array, key: jax.Array) -> Transition:
-        """G minibatches, each row real with probability λ, on its own (footnote 2). imagined: [C_M, F]."""
+    def minibatches(
+        self, counters: Counters, state: SeedState, imagined: jax.Array, real_ratio: jax.Array, key: jax.Array
+    ) -> Transition:
+        """G minibatches, each row real with probability λ, on its own (footnote 2). imagined: [C_M, F], λ []."""
         shape = (self.settings.updates_per_step, self.settings.policy_batch_size)
         source_key, real_key, imagined_key = jax.random.split(key, 3)
         real_index = replay.sample_indices(real_key, shape, counters.env_steps, state.real.shape[0])
@@ -172,6 +175,6 @@ class PsMbpo(Algorithm):
         imagined_index = replay.sample_newest_indices(
             imagined_key, shape, counters.imagined_rows, imagined.shape[0], newest
         )
-        from_real = jax.random.uniform(source_key, shape) < self.real_ratio(counters, state)
+        from_real = jax.random.uniform(source_key, shape) < real_ratio
         rows = jnp.where(from_real[..., None], state.real[real_index], imagined[imagined_index])
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
