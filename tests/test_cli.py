@@ -203,6 +203,7 @@ def test_saved_settings_are_loaded_as_they_were(tmp_path):
     [
         ("n_models=3", "n_models=3: contradicts the run in"),
         ("env=hopper", "env=hopper: contradicts the run in"),
+        ("real_ratio_schedule=bandit", "real_ratio_schedule=bandit: contradicts the run in"),
         ("real_ratio=0.25", "real_ratio=0.25: contradicts the run in"),
     ],
 )
@@ -212,8 +213,9 @@ def test_a_resumed_run_keeps_its_settings(tmp_path, override, line):
         config.resolve([f"run_dir={tmp_path}", override])
 
 
-def test_a_resumed_run_may_be_prolonged(tmp_path):
-    config.save(config.compose(["size=tiny", f"run_dir={tmp_path}"]), tmp_path)
+@pytest.mark.parametrize("switches", [[], ["real_ratio_schedule=bandit", "real_ratio_arms=[0,0.5]"]])
+def test_a_resumed_run_may_be_prolonged(tmp_path, switches):
+    config.save(config.compose(["size=tiny", f"run_dir={tmp_path}", *switches]), tmp_path)
     again = config.resolve([f"run_dir={tmp_path}", "total_steps=400", "n_models=2", "backend=auto"])
     assert again.total_steps == 400
 
