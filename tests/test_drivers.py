@@ -231,6 +231,15 @@ def test_other_evaluation_policies(policy, algo, action):
     assert float(returns.episode_return[0, 0]) == pytest.approx(1 - action**2, abs=1e-4)
 
 
+@pytest.mark.parametrize(("arms", "fitted"), [([1.0], False), ([0.3, 1.0], True)])
+def test_a_choice_among_real_data_alone_needs_no_models(arms, fitted):
+    settings = settings_for(real_ratio_schedule="bandit", real_ratio_arms=arms, total_steps=160, epoch_steps=160)
+    assert settings.imagines == fitted
+    driver = make_driver("scan", True, settings)
+    state, _ = driver.run(driver.init(*initial_inputs(settings)), settings.epoch_steps // settings.stride)
+    assert (np.asarray(state.seeds.models.optimizer.count) > 0).all() == fitted
+
+
 def test_the_average_of_policies_is_evaluated_as_it_acts():
     """With `posterior=average` every step is some member's mean action, never the mean of several."""
     settings = settings_for(posterior="average", eval_episodes=40)

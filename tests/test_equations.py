@@ -104,7 +104,7 @@ def test_infinite_temperature_is_uniform():
 def test_members_are_drawn_with_the_probabilities_of_equation_19():
     earned = Posterior(jnp.array([10.0, 20.0, 0.0, 15.0]), jnp.zeros(4))
     keys = jax.random.split(jax.random.key(1), 20_000)
-    members, probs = jax.vmap(lambda key: posterior.draw(posterior.logits(earned, 10.0), key))(keys)
+    members, probs = jax.vmap(lambda key: posterior.draw(earned, jnp.float32(10.0), key))(keys)
     counts = np.bincount(members, minlength=4)
     expected = np.asarray(probs[0], np.float64)
     assert scipy.stats.chisquare(counts, expected / expected.sum() * 20_000).pvalue > 1e-3

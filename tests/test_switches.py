@@ -10,7 +10,7 @@ import scipy.integrate
 import scipy.stats
 
 from tests import probes
-from tests.helpers import algorithm, tiny
+from tests.helpers import algorithm, assert_probabilities_follow, tiny
 from tests.test_drivers import make_driver, settings_for
 from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, mixture, posterior
@@ -72,7 +72,7 @@ def test_of_a_run_s_updates_the_linear_schedule_uses_as_many_real_rows_as_the_co
         real_ratio_schedule="linear", real_ratio=mean, total_steps=12_000, warmup_steps=4_000, replay_capacity=5000
     )
     hyper, steps = Hyper.of(settings), jnp.arange(settings.first_learning_step, settings.total_steps)
-    ratios = jax.vmap(lambda t: mixture.real_ratios(settings, hyper, t)[0])(steps)
+    ratios = jax.vmap(lambda t: mixture.real_ratios(settings, hyper, None, t)[0])(steps)
     assert float(ratios.mean()) == pytest.approx(mean, abs=1e-3)
     assert float(ratios[0]) == 1
 
@@ -85,41 +85,77 @@ def test_the_linear_schedule_of_no_or_only_real_data_is_constant(mean):
 ARMS = (0.0, 0.1, 0.3, 0.5)
 
 
-def _bandit(returns, counts, *, lowest=0.0, highest=1.0, rounds=10):
-    numbers = (jnp.asarray(x, jnp.float32) for x in (returns, counts))
-    return Bandit(*numbers, jnp.int32(rounds), jnp.float32(lowest), jnp.float32(highest))
+def _bandit(gains, counts):
+    """A range of 0 to 1."""
+    numbers = (jnp.asarray(x, jnp.float32) for x in (gains, counts))
+    return Bandit(*numbers, jnp.int32(10), jnp.float32(0.0), jnp.float32(1.0))
 
 
-def test_policy_m_learns_with_arm_m_mod_k():
-    settings = tiny(n_policies=5, real_ratio_schedule="bandit", real_ratio_arms=list(ARMS))
-    np.testing.assert_allclose(mixture.real_ratios(settings, Hyper.of(settings), 0), [0.0, 0.1, 0.3, 0.5, 0.0])
-    constant = tiny(n_policies=2, real_ratio=0.4)
-    np.testing.assert_allclose(mixture.real_ratios(constant, Hyper.of(constant), 0), [0.4, 0.4])
-
-
-def test_an_episode_is_credited_to_its_arm_and_older_ones_are_discounted():
-    bandit, yes, no = (
-        mixture.init(tiny(real_ratio_schedule="bandit", real_ratio_arms=list(ARMS), n_policies=4)),
-        jnp.bool_(True),
-        jnp.bool_(False),
-    )
-    np.testing.assert_allclose(mixture.probabilities(bandit), 0.25, rtol=1e-5)
-    bandit = mixture.credit(bandit, 3, -20.0, done=yes, counts=no)  # a random episode: the range only
-    bandit = mixture.credit(bandit, 1, 60.0, done=yes, counts=yes)
-    bandit = mixture.credit(bandit, 2, 1e6, done=no, counts=no)  # runs on
-    bandit = mixture.credit(bandit, 2, 20.0, done=yes, counts=yes)
-    left = 1 - 1 / (8 * math.sqrt(2))
-    wins, losses = mixture.beliefs(bandit)
-    np.testing.assert_allclose(wins, [1, 1 + left, 1.5, 1], rtol=1e-6)  # 60 is the best of -20 to 60, 20 half way
-    np.testing.assert_allclose(losses, [1, 1, 1.5, 1], rtol=1e-6)
-
-
-def test_before_the_first_success_arms_take_turns():
+def _credited(*episodes):
+    """What is known of four arms after these: arm and return each."""
     bandit = mixture.init(tiny(real_ratio_schedule="bandit", real_ratio_arms=list(ARMS), n_policies=4))
-    for arm in (0, 1, 1):
-        bandit = mixture.credit(bandit, arm, 0.0, done=jnp.bool_(True), counts=jnp.bool_(True))
-    probs = mixture.probabilities(bandit)
-    assert probs[1] < probs[0] < probs[2] == pytest.approx(float(probs[3]))
+    for arm, episode_return in episodes:
+        bandit = mixture.credit(bandit, arm, jnp.float32(episode_return))
+    return bandit
+
+
+def test_members_learn_with_arms_in_the_shares_of_their_probabilities():
+    """N = 2, M = 5; X ~ Beta(1, 1) against Beta(c, 1): probabilities 1 / (1 + c) and c / (1 + c)."""
+    settings = tiny(n_models=2, n_policies=5, real_ratio_schedule="bandit", real_ratio_arms=[0.1, 0.5])
+
+    def ratios(c):
+        return mixture.real_ratios(settings, Hyper.of(settings), _bandit([0.0, c - 1], [0.0, c - 1]), 0).reshape(2, 5)
+
+    low, high = 0.1, 0.5
+    np.testing.assert_allclose(ratios(1.01)[0], [low, low, low, high, high])  # half of ten: m first, then n
+    np.testing.assert_allclose(ratios(1.01)[1], [low, low, high, high, high])
+    np.testing.assert_allclose(ratios(4)[:, 0], low)  # 0.2 of ten
+    np.testing.assert_allclose(ratios(4)[:, 1:], high)
+    np.testing.assert_allclose(ratios(99), high)  # 0.01: it rests
+
+
+def test_at_first_all_arms_have_members():
+    settings = tiny(n_models=1, n_policies=4, real_ratio_schedule="bandit", real_ratio_arms=list(ARMS))
+    bandit = mixture.init(settings)
+    np.testing.assert_allclose(mixture.real_ratios(settings, Hyper.of(settings), bandit, 0), ARMS)
+    constant = tiny(n_models=1, n_policies=2, real_ratio=0.4)
+    np.testing.assert_allclose(mixture.real_ratios(constant, Hyper.of(constant), None, 0), [0.4, 0.4])
+
+
+def test_nothing_known_is_an_equal_chance():
+    np.testing.assert_allclose(mixture.probabilities(_credited()), 0.25, rtol=1e-5)
+
+
+def test_an_episode_is_credited_to_its_arm_and_older_ones_are_forgotten():
+    wins, losses = mixture.beliefs(_credited((1, 60.0), (2, 20.0)))
+    second = 1 - 1 / (8 * math.sqrt(2))
+    np.testing.assert_allclose(wins, [1, 1 + second, 1, 1], rtol=1e-6)  # 60 is the top of the range, 20 its bottom
+    np.testing.assert_allclose(losses, [1, 1, 2, 1], rtol=1e-6)
+    wins, losses = mixture.beliefs(_credited((1, 60.0), (2, 20.0), (3, 30.0)))
+    third = 1 - 1 / (8 * math.sqrt(3))
+    lowest, span = 40 - 20 * third, 40 * third  # of 20 to 60, shrunk around its middle
+    gain = (30 - lowest) / span
+    np.testing.assert_allclose(wins, [1, 1 + second * third, 1, 1 + gain], rtol=1e-5)
+    np.testing.assert_allclose(losses, [1, 1, 1 + third, 2 - gain], rtol=1e-5)
+
+
+def test_an_outlier_is_forgotten():
+    """Arm 0 earns 900, arm 1 600; once something went wrong."""
+    episodes = [(i % 2, 900.0 - 300.0 * (i % 2)) for i in range(100)]
+    clean, spoilt = (
+        mixture.probabilities(_credited(*episodes[:10], *odd, *episodes[10:])) for odd in ([], [(2, -9e3)])
+    )
+    assert clean[0] - clean[1] > 0.5
+    assert spoilt[0] - spoilt[1] > 0.4
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, -2500.0, 1e6])
+def test_before_the_first_success_arms_take_turns(value):
+    """All returns are equal: rounding must not tell arms apart that have nothing between them."""
+    once = mixture.probabilities(_credited((0, value), (1, value), (1, value)))
+    assert once[1] < once[0] < once[2] == pytest.approx(float(once[3]))
+    often = mixture.probabilities(_credited(*((i % 4, value) for i in range(80))))
+    np.testing.assert_allclose(often, 0.25, atol=0.05)
 
 
 def test_the_probability_to_be_the_best_in_closed_form():
@@ -128,9 +164,13 @@ def test_the_probability_to_be_the_best_in_closed_form():
     np.testing.assert_allclose(probs, [5 / 7.5, 2.5 / 7.5], atol=1e-4)
 
 
-@pytest.mark.parametrize("scale", [1, 10, 200])
-def test_the_probability_to_be_the_best_by_quadrature(scale):
-    gains, counts = scale * np.array([0.9, 0.5, 0.7]), scale * np.array([1.0, 1.1, 0.95])
+@pytest.mark.parametrize(
+    ("gains", "counts"),
+    [([0.9, 0.5, 0.7], [1, 1.1, 0.95]), ([140, 138, 136], 200), ([0.2, 0.1, 0.0], 300), ([99.9, 100, 99.5], 100)],
+    ids=["few rounds", "many", "nearly all lost", "nearly all won"],
+)
+def test_the_probability_to_be_the_best_by_quadrature(gains, counts):
+    counts = np.broadcast_to(counts, 3)
     laws = [scipy.stats.beta(1 + g, 1 + c - g) for g, c in zip(gains, counts, strict=True)]
 
     def density(x, arm):
@@ -138,17 +178,8 @@ def test_the_probability_to_be_the_best_by_quadrature(scale):
 
     points = [law.mean() for law in laws]
     exact = [scipy.integrate.quad(density, 0, 1, args=(arm,), points=points, limit=500)[0] for arm in range(3)]
+    np.testing.assert_allclose(sum(exact), 1, atol=1e-6)
     np.testing.assert_allclose(mixture.probabilities(_bandit(gains, counts)), exact, atol=2e-4)
-
-
-def test_an_arm_is_drawn_first_and_then_one_of_its_members():
-    """N = 2, M = 3, two arms: policies 0 and 2 of each model have arm 0."""
-    settings = tiny(n_models=2, n_policies=3, real_ratio_schedule="bandit", real_ratio_arms=[0.0, 0.5])
-    bandit, scores = _bandit([2.0, 0.5], [3.0, 3.0]), jnp.log(jnp.array([1.0, 3.0, 2.0, 4.0, 5.0, 3.0]))
-    probs = jax.nn.softmax(mixture.by_arm(bandit, settings, scores))
-    first, second = np.asarray(mixture.probabilities(bandit))
-    expected = first * np.array([1, 0, 2, 4, 0, 3]) / 10 + second * np.array([0, 3, 0, 0, 5, 0]) / 8
-    np.testing.assert_allclose(probs, expected, rtol=1e-5)
 
 
 def test_the_bandit_follows_the_best_arm_when_it_changes():
@@ -158,7 +189,7 @@ def test_the_bandit_follows_the_best_arm_when_it_changes():
         best, key = xs
         arm = jax.random.categorical(key, jnp.log(mixture.probabilities(bandit)))
         gain = jnp.where(arm == best, 0.9, 0.1)
-        return mixture.credit(bandit, arm, gain, jnp.bool_(True), jnp.bool_(True)), gain
+        return mixture.credit(bandit, arm, gain), gain
 
     best = jnp.where(jnp.arange(400) < 200, 0, 3)
     _, gains = jax.lax.scan(
@@ -205,7 +236,7 @@ def adapted():
     return run(
         real_ratio_schedule="bandit",
         real_ratio_arms=RATIOS,
-        temperature=1.0,
+        temperature=100.0,
         **{"sweep.forced_exploration": EXPLORATION},
     )
 
@@ -246,42 +277,46 @@ def test_each_policy_learns_with_its_own_ratio(adapted):
             assert all(jax.tree.leaves(same)) == (lane == member % 2)
 
 
-def test_who_acts_can_be_recomputed_from_the_log(adapted):
-    """Arms from the discounted gains of earlier episodes, members among them by equation 19."""
+def test_what_is_chosen_can_be_recomputed_from_the_log(adapted):
+    """Who acts by equation 19; the arms' probabilities from the discounted gains of earlier episodes, and from them the
+    members' λ."""
     settings, _, _, lines, epochs = adapted
-    gains = {0: [], 1: []}  # return and the rounds after it that discount it
-    seen, earned, rounds = [], np.zeros((settings.n_models, 2)), 0
+    lines, epochs = ([line for line in some if line["forced_exploration"] == 0.0] for some in (lines, epochs))
+    assert_probabilities_follow(lines, settings.n_models, settings)
+    history, rounds = {0: [], 1: []}, 0  # return and round
+    low, high = 0.0, 0.0
 
     def arm_probabilities():
-        low, high = (min(seen), max(seen)) if seen else (0.0, 0.0)
         laws = []
         for arm in (0, 1):
-            weights = np.array(
-                [math.prod(1 - 1 / (8 * math.sqrt(r)) for r in range(since + 1, rounds + 1)) for _, since in gains[arm]]
-            )
-            wins = np.array([(value - low) / max(high - low, 1e-6) for value, _ in gains[arm]])
-            laws.append(
-                scipy.stats.beta(1 + weights @ wins, 1 + weights @ (1 - wins)) if gains[arm] else scipy.stats.beta(1, 1)
-            )
+            ages = [
+                math.prod(1 - 1 / (8 * math.sqrt(r)) for r in range(born + 1, rounds + 1)) for _, born in history[arm]
+            ]
+            wins = sum(age * (value - low) for age, (value, _) in zip(ages, history[arm], strict=True))
+            wins = min(max(wins / max(high - low, 1e-6), 0.0), sum(ages))
+            laws.append(scipy.stats.beta(1 + wins, 1 + sum(ages) - wins))
         first = scipy.integrate.quad(lambda x: laws[0].pdf(x) * laws[1].cdf(x), 0, 1, limit=200)[0]
         return np.array([first, 1 - first])
 
-    checked = 0
-    for line in (line for line in lines if line["forced_exploration"] == 0.0):
-        if line["episode"] % 10 == 1 or line["episode"] > 100:
-            within = np.exp(earned - earned.max(axis=0))
-            expected = arm_probabilities() * within / within.sum(axis=0)
-            np.testing.assert_allclose(line["probs"], expected, atol=1e-3)
-            checked += not line["random"]
-        seen.append(line["return"])
-        if not line["random"]:
-            rounds += 1
-            gains[line["policy"]].append((line["return"], rounds))
-            earned[line["model"], line["policy"]] += line["return"]
-    assert checked > 10
-    last = [line for line in epochs if line["forced_exploration"] == 0.0][-1]
-    np.testing.assert_allclose(last["real_ratio_probs"], arm_probabilities(), atol=1e-3)
-    assert last["real_ratio"] == pytest.approx(float(np.dot(last["real_ratio_probs"], RATIOS)), rel=1e-5)
+    probs, arms_played = arm_probabilities(), []
+    for line in lines:
+        if line["random"]:
+            continue
+        rank = line["policy"] * settings.n_models + line["model"]
+        arm = int((rank + 0.5) / settings.n_members > probs[0])
+        arms_played.append(arm)
+        rounds += 1
+        half = (high - low) / 2 * (1 - 1 / (8 * math.sqrt(rounds)))
+        ends = [line["return"]] if rounds == 1 else [(high + low) / 2 - half, (high + low) / 2 + half, line["return"]]
+        low, high = min(ends), max(ends)
+        history[arm].append((line["return"], rounds))
+        probs = arm_probabilities()
+        if line["env_steps"] == epochs[-1]["env_steps"]:
+            np.testing.assert_allclose(epochs[-1]["real_ratio_probs"], probs, atol=1e-3)
+    assert line["env_steps"] == epochs[-1]["env_steps"]  # an episode ends with the run, so that this was looked at
+    assert set(arms_played) == {0, 1}
+    with_second = sum((rank + 0.5) / 4 > probs[0] for rank in range(4))
+    assert epochs[-1]["real_ratio"] == pytest.approx((RATIOS[0] * (4 - with_second) + RATIOS[1] * with_second) / 4)
 
 
 def test_priors_stay_as_they_were_drawn(averaged):

@@ -286,6 +286,7 @@ def test_ticks_cover_their_range_in_round_steps():
     assert svg.ticks(0, 1) == [0, 0.2, 0.4, 0.6, 0.8, 1]
     assert svg.ticks(1, 150) == [0, 50, 100, 150]
     assert svg.ticks(0, 1003) == [0, 500, 1000, 1500]
+    assert svg.ticks(-7, 0) == [-8, -6, -4, -2, 0]
     assert len(svg.ticks(0, 0)) >= 2
 
 

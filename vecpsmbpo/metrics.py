@@ -121,10 +121,9 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     updates = stats.pop("updates")
     env_steps = int(state.counters.env_steps)
     fitted = np.asarray(seeds.models.optimizer.count)[:, 0] > 0
-    ratios = jax.vmap(lambda hyper: mixture.real_ratios(settings, hyper, state.counters.env_steps)[0])(seeds.hyper)
-    if seeds.bandit is not None:
-        arms = np.asarray(jax.vmap(mixture.probabilities)(seeds.bandit))
-        ratios = arms @ np.asarray(settings.real_ratio_arms)  # the mean λ of who acts next
+    ratios = jax.vmap(lambda hyper, bandit: mixture.real_ratios(settings, hyper, bandit, state.counters.env_steps))(
+        seeds.hyper, seeds.bandit
+    ).mean(axis=1)
     lines = []
     for seed in range(len(settings.lanes)):
         episodes = float(seeds.epoch_episodes[seed])
@@ -147,7 +146,8 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
             }
         )
         if seeds.bandit is not None:
-            lines[-1]["real_ratio_probs"] = arms[seed].tolist()
+            bandit = jax.tree.map(lambda x, seed=seed: x[seed], seeds.bandit)
+            lines[-1]["real_ratio_probs"] = mixture.probabilities(bandit).tolist()
     return lines
 
 

@@ -7,16 +7,16 @@ from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Bandit, Hyper
 
 
-def real_ratios(settings: Settings, hyper: Hyper, env_steps: jax.Array) -> jax.Array:
-    """[M] the λ with which policies m = 0, 1, ... of every model learn now."""
-    if settings.adapts_real_ratio:
-        return jnp.asarray(settings.real_ratio_arms)[arm_of(settings, jnp.arange(settings.n_policies))]
+def real_ratios(settings: Settings, hyper: Hyper, bandit: Bandit | None, env_steps: jax.Array) -> jax.Array:
+    """[N·M] the λ with which each member learns now."""
+    if bandit is not None:
+        return jnp.asarray(settings.real_ratio_arms)[arms_of_members(settings, bandit)]
     ratio = hyper.real_ratio
     if settings.real_ratio_schedule == "linear":
         # Of the steps that learn, so that as many real rows are used as with the constant.
         learning = max(settings.total_steps - settings.first_learning_step, 1)
         ratio = linear(ratio, jnp.maximum(env_steps - settings.first_learning_step, 0) / learning)
-    return jnp.broadcast_to(ratio, (settings.n_policies,))
+    return jnp.broadcast_to(ratio, (settings.n_members,))
 
 
 def linear(mean: jax.Array, progress: jax.Array) -> jax.Array:
@@ -32,33 +32,45 @@ def linear(mean: jax.Array, progress: jax.Array) -> jax.Array:
     return jnp.clip(1 - (progress - start) / jnp.maximum(length, 1e-6), 0.0, 1.0)
 
 
-# ── the bandit: discounted Thompson sampling (Raj and Kalyani, 2017; regret: Qi, Guo and Zhu, 2025) ──────────────
+# ── the bandit: discounted Thompson sampling (Raj and Kalyani, 2017) ─────────────────────────────────────────────
 #
-# An arm is a value of λ, and policy m of every model learns with arm m mod K throughout: what one arm does to a critic
-# is its own, all arms learn from the same real data D_E, and where there are M >= K policies anyhow this costs nothing.
-# A round is an episode: an arm is drawn, and the member that acts among those of the arm by equation 18 or 19. It gains
-# the episode's return. (The other way, all policies changing λ together every epoch, was tried: one epoch of a bad λ
-# spoils all critics, and the blame falls on the arm after it; docs/results.md.)
+# An arm is a value of λ, a round is an episode, and the arm of the member that acts gains the episode's return. From
+# what is known of the arms follows how likely each is the best; Thompson sampling draws arms with that probability, and
+# here every member is such a draw: of N·M members, a share p_i learns with arm i, and whichever of them equation 18 or
+# 19 lets act plays its arm. At first all arms learn side by side, each with critics of its own, from the same real
+# data D_E; when one shows to be better, more and more members learn with it. Two other ways were tried
+# (docs/results.md): λ changed every epoch for all members together spoils all critics in an epoch of a bad λ and blames
+# the arm after it; and with an arm for each member for good, the best one learns from data of which the others gather
+# most.
 #
 # What an arm is worth changes while it learns, so that a rule which competes with the best single arm in hindsight
 # (explore-then-commit, UCB, Exp3) competes with the wrong thing. Exp3.S and its kin follow changes whatever causes
 # them, but are made for an opponent who knows the algorithm, and need hundreds of rounds where runs have tens to
-# hundreds of episodes. Thompson sampling is the paper's own principle one level up. Discounting forgets what policies
-# earned when they knew less; with it, regret against the best arm of every moment is within logarithms of optimal for
-# arms that jump, and sublinear for arms that drift.
+# hundreds of episodes. Thompson sampling is the paper's own principle one level up, and discounting forgets what
+# members earned when they knew less. Where arms change a few times and not because of the choices, its regret against
+# the best arm of every moment is within logarithms of optimal (Qi, Guo and Zhu, 2025, for Gaussian beliefs and a tuned
+# discount). Here arms learn from what the others see; no rule has a guarantee for that.
 
 GRID = 512
 
 
-def arm_of(settings: Settings, member: jax.Array) -> jax.Array:
-    """The arm of member n·M + m."""
-    return member % settings.n_policies % len(settings.real_ratio_arms)
+def arms_of_members(settings: Settings, bandit: Bandit) -> jax.Array:
+    """[N·M] the arm of each member: the arms' probabilities cut into N·M equal pieces, in the order of λ.
+
+    So a member's λ moves from one arm to the next or stays; m decides before n, so that every model has members of high
+    and of low λ. An arm less likely than half a piece rests until forgetting makes it likelier again.
+    """
+    member = jnp.arange(settings.n_members)
+    models = settings.n_members // settings.n_policies
+    rank = member % settings.n_policies * models + member // settings.n_policies
+    arm = jnp.searchsorted(jnp.cumsum(probabilities(bandit)), (rank + 0.5) / settings.n_members)
+    return jnp.minimum(arm, bandit.counts.shape[0] - 1)
 
 
 def init(settings: Settings) -> Bandit:
     """Nothing is known: arms are equally likely."""
     nothing, most = jnp.zeros(len(settings.real_ratio_arms)), jnp.float32(1e30)
-    return Bandit(returns=nothing, counts=nothing, rounds=jnp.int32(0), lowest=most, highest=-most)
+    return Bandit(excess=nothing, counts=nothing, rounds=jnp.int32(0), lowest=most, highest=-most)
 
 
 def discount(rounds: jax.Array) -> jax.Array:
@@ -68,53 +80,50 @@ def discount(rounds: jax.Array) -> jax.Array:
     for their total, which nobody knows before episodes end. Arms that drift as policies do are followed better with
     twice that memory.
     """
-    return 1 - 1 / (8 * jnp.sqrt(jnp.maximum(rounds, 1)))
+    return 1 - 1 / (8 * jnp.sqrt(rounds))
 
 
-def credit(bandit: Bandit, arm: jax.Array, episode_return: jax.Array, done: jax.Array, counts: jax.Array) -> Bandit:
-    """Adds the return of an episode that is `done` to its arm where it `counts`. Random episodes set the scale only."""
-    rounds = bandit.rounds + counts
-    kept = jnp.where(counts, discount(rounds), 1.0)
-    one = counts * jax.nn.one_hot(arm, bandit.counts.shape[0])
+def credit(bandit: Bandit, arm: jax.Array, episode_return: jax.Array) -> Bandit:
+    """Adds an episode's return to its arm.
+
+    The range shrinks around its middle as old rounds are forgotten, and always holds the newest return: an outlier or
+    the returns of the first policies do not make all later ones look alike. Sums are of what lies above the lower end,
+    since sums of the returns themselves, thousands each, would leave nothing but rounding where all are equal.
+    """
+    rounds = bandit.rounds + 1
+    kept = discount(rounds)
+    middle, half = (bandit.highest + bandit.lowest) / 2, (bandit.highest - bandit.lowest) / 2 * kept
+    lowest, highest = jnp.minimum(middle - half, episode_return), jnp.maximum(middle + half, episode_return)
+    excess = bandit.excess + bandit.counts * (bandit.lowest - lowest)
+    one = jax.nn.one_hot(arm, bandit.counts.shape[0])
     return Bandit(
-        returns=kept * bandit.returns + one * episode_return,
+        excess=kept * excess + one * (episode_return - lowest),
         counts=kept * bandit.counts + one,
         rounds=rounds,
-        lowest=jnp.where(done, jnp.minimum(bandit.lowest, episode_return), bandit.lowest),
-        highest=jnp.where(done, jnp.maximum(bandit.highest, episode_return), bandit.highest),
+        lowest=lowest,
+        highest=highest,
     )
 
 
 def beliefs(bandit: Bandit) -> tuple[jax.Array, jax.Array]:
     """[K] each: the parameters of the Beta distribution of what each arm gains, uniform at first.
 
-    A gain is where the return lies in the range of all returns so far, from 0 to 1; a gain of 0.3 is 0.3 successes and
-    0.7 failures. While all returns are equal, as before the first success of a sparse task, all gains are 0: arms that
-    were tried less are tried next.
+    A gain is where the return lies in the range of returns, from 0 to 1; a gain of 0.3 is 0.3 successes and 0.7
+    failures. While all returns are equal, as before the first success of a sparse task, all gains are 0: arms that were
+    tried less are tried next.
     """
-    span = jnp.maximum(bandit.highest - bandit.lowest, 1e-6)
-    gains = jnp.clip((bandit.returns - bandit.counts * bandit.lowest) / span, 0.0, bandit.counts)
+    gains = jnp.clip(bandit.excess / jnp.maximum(bandit.highest - bandit.lowest, 1e-6), 0.0, bandit.counts)
     return 1 + gains, 1 + bandit.counts - gains
 
 
 def probabilities(bandit: Bandit) -> jax.Array:
     """[K] how likely each arm is the best, ∫ p_i(x) Π_{j ≠ i} P(x_j < x) dx: the distribution that Thompson sampling
-    draws from, by the midpoint rule.
-
-    It could be drawn from without being known, but who acts is drawn once, from a distribution that is logged.
-    """
+    draws from. By the midpoint rule over θ, x = sin² θ, where Beta distributions are about as wide everywhere."""
     wins, losses = beliefs(bandit)
-    x = (jnp.arange(GRID) + 0.5) / GRID
-    mass = jax.nn.softmax((wins - 1)[:, None] * jnp.log(x) + (losses - 1)[:, None] * jnp.log1p(-x), axis=1)
+    angle = jnp.pi / 2 * (jnp.arange(GRID) + 0.5) / GRID
+    log_sin, log_cos = jnp.log(jnp.sin(angle)), jnp.log(jnp.cos(angle))
+    mass = jax.nn.softmax((2 * wins - 1)[:, None] * log_sin + (2 * losses - 1)[:, None] * log_cos, axis=1)
     below = jnp.cumsum(mass, axis=1) - mass / 2
     itself = jnp.eye(mass.shape[0], dtype=bool)[:, :, None]
     best = jnp.sum(mass * jnp.prod(jnp.where(itself, 1.0, below), axis=1), axis=1)
     return best / jnp.sum(best)
-
-
-def by_arm(bandit: Bandit, settings: Settings, logits: jax.Array) -> jax.Array:
-    """[N·M] logits of drawing an arm and then, by the `logits` given, one of its members."""
-    arm = arm_of(settings, jnp.arange(settings.n_members))
-    arms = jnp.arange(bandit.counts.shape[0])
-    of_arm = jax.nn.logsumexp(jnp.where(arms[:, None] == arm, logits, -jnp.inf), axis=1)
-    return logits - of_arm[arm] + jnp.log(probabilities(bandit))[arm]

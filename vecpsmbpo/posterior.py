@@ -33,9 +33,10 @@ def best(posterior: Posterior) -> jax.Array:
     return jnp.argmax(logits(posterior, jnp.float32(1.0)))
 
 
-def draw(logits: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def draw(posterior: Posterior, temperature: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """A member, [] int, and the distribution [N·M] that it was drawn from."""
-    return jax.random.categorical(key, logits), jax.nn.softmax(logits)
+    scores = logits(posterior, temperature)
+    return jax.random.categorical(key, scores), jax.nn.softmax(scores)
 
 
 def exploration_probability(forced_exploration: jax.Array, episode: jax.Array) -> jax.Array:

@@ -162,7 +162,9 @@ class Settings:
     def imagines(self) -> bool:
         """Whether any lane ever learns from imagined data (λ < 1)."""
         ratios = dict(self.sweep).get("real_ratio", (self.real_ratio,))
-        return self.real_ratio_schedule != "constant" or min(ratios) < 1
+        if self.adapts_real_ratio:
+            ratios = self.real_ratio_arms
+        return self.real_ratio_schedule == "linear" or min(ratios) < 1
 
     @property
     def refreshes_per_epoch(self) -> int:
@@ -343,14 +345,11 @@ def _contradictions(one: Settings) -> Iterator[tuple[bool, str]]:
         (one.alternates or one.plans) and one.posterior == "average",
         f"posterior=average: there are no policies to average with {name}",
     )
-    yield (
-        one.adapts_real_ratio and one.n_policies < len(one.real_ratio_arms),
-        f"n_policies={one.n_policies}: must be at least {len(one.real_ratio_arms)}, one for each of real_ratio_arms, "
-        "with real_ratio_schedule=bandit",
-    )
+    arms = ", ".join(f"{arm:g}" for arm in one.real_ratio_arms)
+    yield list(one.real_ratio_arms) != sorted(set(one.real_ratio_arms)), f"real_ratio_arms=[{arms}]: must rise"
     yield (
         one.adapts_real_ratio and one.posterior == "average",
-        "posterior=average: leaves nothing to choose for real_ratio_schedule=bandit",
+        "posterior=average: no policy earns what real_ratio_schedule=bandit would choose by",
     )
     yield one.plan_elites > one.plan_population, f"plan_elites={one.plan_elites}: must be at most plan_population"
     yield (

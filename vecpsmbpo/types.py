@@ -166,12 +166,12 @@ class Bandit(struct.PyTreeNode):
     """What is known of the K values of λ to choose from (`mixture`).
 
     Attributes:
-        returns, counts: [K], sum and number of the returns of each arm's episodes, older ones discounted.
+        excess, counts: [K], sum of returns above `lowest`, and number, of each arm's episodes, older ones discounted.
         rounds: [] int, episodes so far.
-        lowest, highest: [], returns of all finished episodes, random ones too; ±1e30 where there is none.
+        lowest, highest: [], the range of returns, in which old ones are forgotten; ±1e30 before the first.
     """
 
-    returns: jax.Array
+    excess: jax.Array
     counts: jax.Array
     rounds: jax.Array
     lowest: jax.Array

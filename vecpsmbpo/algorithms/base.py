@@ -16,18 +16,7 @@ import numpy as np
 from vecpsmbpo import dynamics, imagination, mixture, posterior, replay
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import (
-    Bandit,
-    Counters,
-    EnvSpec,
-    Episode,
-    EpisodeEnd,
-    Hyper,
-    Moments,
-    Posterior,
-    SeedState,
-    Transition,
-)
+from vecpsmbpo.types import Counters, EnvSpec, Episode, EpisodeEnd, Hyper, Moments, SeedState, Transition
 
 
 @dataclass(frozen=True)
@@ -100,7 +89,7 @@ class Algorithm(ABC):
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
             moments=Moments(jnp.zeros(size + spec.obs_size), jnp.zeros(size + spec.obs_size), inputs=size),
             posterior=members,
-            episode=self._begin_episode(members, bandit, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
+            episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
             memory=self.memory(),
             bandit=bandit,
             epoch_return=jnp.zeros(()),
@@ -148,9 +137,11 @@ class Algorithm(ABC):
         counts = done & ~episode.random
         members = posterior.credit(state.posterior, episode.member, total, counts)
         if bandit is not None:
-            bandit = mixture.credit(bandit, mixture.arm_of(self.settings, episode.member), total, done, counts)
+            arm = mixture.arms_of_members(self.settings, bandit)[episode.member]
+            credited = mixture.credit(bandit, arm, total)
+            bandit = jax.tree.map(partial(jnp.where, counts), credited, bandit)
         random = counters.env_steps + 1 < self.settings.warmup_steps
-        following = self._begin_episode(members, bandit, state.hyper, episode.index + 1, random, key)
+        following = self._begin_episode(members, state.hyper, episode.index + 1, random, key)
         running = episode.replace(episode_return=total, length=length)
         state = state.replace(
             real=replay.add(state.real, replay.pack(transition)[None], counters.env_steps),
@@ -164,18 +155,8 @@ class Algorithm(ABC):
         )
         return state, end
 
-    def draw_member(
-        self, members: Posterior, bandit: Bandit | None, hyper: Hyper, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """The member that acts next, [] int, and the distribution [N·M] that it was drawn from: that of equation 18 or
-        19, among the members of an arm that the bandit chooses, if there is one."""
-        logits = posterior.logits(members, hyper.temperature)
-        if bandit is not None:
-            logits = mixture.by_arm(bandit, self.settings, logits)
-        return posterior.draw(logits, key)
-
-    def _begin_episode(self, members, bandit, hyper: Hyper, index, random, key: jax.Array) -> Episode:
-        member, probs = self.draw_member(members, bandit, hyper, key)
+    def _begin_episode(self, members, hyper: Hyper, index, random, key: jax.Array) -> Episode:
+        member, probs = posterior.draw(members, hyper.temperature, key)
         if self.settings.posterior == "average":
             member = jnp.int32(-1)
         explores = posterior.exploration_probability(hyper.forced_exploration, index)
@@ -186,8 +167,8 @@ class Algorithm(ABC):
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
     def real_ratios(self, counters: Counters, state: SeedState) -> jax.Array:
-        """[M] the λ of every model's policies now."""
-        return mixture.real_ratios(self.settings, state.hyper, counters.env_steps)
+        """[N·M] the λ of each member now."""
+        return mixture.real_ratios(self.settings, state.hyper, state.bandit, counters.env_steps)
 
     def begin_epoch(self, counters: Counters, state: SeedState) -> SeedState:
         """Clears the epoch's sums when an epoch begins."""

@@ -39,7 +39,7 @@ class PsMbpo(Algorithm):
         if self.settings.eval_policy == "best":
             member = posterior.best(state.posterior)
         else:
-            member, _ = self.draw_member(state.posterior, state.bandit, state.hyper, key)
+            member, _ = posterior.draw(state.posterior, state.hyper.temperature, key)
         return self.layout.ask(member, state.agents.actor)
 
     def evaluation_action(
@@ -144,7 +144,7 @@ class PsMbpo(Algorithm):
         layout, nets = self.layout, sac.make_networks(self.settings, self.spec)
         batch_key, update_key = jax.random.split(key)
         ids = layout.member_ids()
-        ratios = self.real_ratios(counters, state)[ids % self.settings.n_policies]
+        ratios = self.real_ratios(counters, state)[ids % self.settings.n_members]  # of padding members, too
         # Minibatches of all members are gathered at once and before the loop over members: looping over the rings
         # themselves would copy each of them whole.
         batches = jax.vmap(lambda imagined, ratio, key: self.minibatches(counters, state, imagined, ratio, key))(

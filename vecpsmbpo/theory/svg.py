@@ -31,7 +31,7 @@ class Series(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """A chart, with its y axis from 0."""
+    """A chart, with 0 on its y axis."""
 
     title: str
     x_label: str
@@ -66,14 +66,16 @@ def ticks(low: float, high: float, about: int = 5) -> list[float]:
 
 def _panel(panel: Panel) -> list[str]:
     x_ticks = ticks(min(line.x.min() for line in panel.series), max(line.x.max() for line in panel.series))
-    y_ticks = ticks(0, max((line.y + (0 if line.error is None else line.error)).max() for line in panel.series))
+    lowest = min(line.y.min() for line in panel.series)
+    highest = max((line.y + (0 if line.error is None else line.error)).max() for line in panel.series)
+    y_ticks = ticks(min(0, lowest), max(0, highest))
     across, down = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
 
     def x_at(value):
         return LEFT + across * (value - x_ticks[0]) / (x_ticks[-1] - x_ticks[0])
 
     def y_at(value):
-        return TOP + down * (1 - value / y_ticks[-1])
+        return TOP + down * (y_ticks[-1] - value) / (y_ticks[-1] - y_ticks[0])
 
     parts = [_text(LEFT + across / 2, TOP - 12, panel.title, "middle", 'font-size="12" font-weight="bold"')]
     for tick in y_ticks:
@@ -90,7 +92,7 @@ def _panel(panel: Panel) -> list[str]:
     for index, line in enumerate(panel.series):
         colour = COLOURS[index % len(COLOURS)]
         if line.error is not None:
-            low, high = np.maximum(line.y - line.error, 0), line.y + line.error
+            low, high = np.maximum(line.y - line.error, y_ticks[0]), line.y + line.error
             around = _points(x_at(line.x), y_at(high)) + " " + _points(x_at(line.x[::-1]), y_at(low[::-1]))
             parts.append(f'<polygon points="{around}" fill="{colour}" fill-opacity="0.15"/>')
         points = _points(x_at(line.x), y_at(line.y))
