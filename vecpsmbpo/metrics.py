@@ -123,7 +123,7 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     fitted = np.asarray(seeds.models.optimizer.count)[:, 0] > 0
     ratios = jax.vmap(lambda hyper, bandit: mixture.real_ratios(settings, hyper, bandit, state.counters.env_steps))(
         seeds.hyper, seeds.bandit
-    ).mean(axis=1)
+    )
     lines = []
     for seed in range(len(settings.lanes)):
         episodes = float(seeds.epoch_episodes[seed])
@@ -141,7 +141,7 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
                 "train_episodes": int(episodes),
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
-                "real_ratio": _number(ratios[seed]),
+                "real_ratio": _number(np.mean(ratios[seed], dtype=np.float64)),
                 "temperature": _number(seeds.hyper.temperature[seed]),
             }
         )

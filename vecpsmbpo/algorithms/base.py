@@ -170,6 +170,14 @@ class Algorithm(ABC):
         """[N·M] the λ of each member now."""
         return mixture.real_ratios(self.settings, state.hyper, state.bandit, counters.env_steps)
 
+    def imagines(self, counters: Counters, state: SeedState) -> jax.Array:
+        """Whether any member may learn from imagined data, [] bool, in the period that begins: λ may fall from 1 within
+        it, and what is then drawn from must be there."""
+        if self.settings.adapts_real_ratio:
+            return jnp.bool_(self.settings.imagines)  # any member may move to any λ
+        last = counters._replace(env_steps=counters.env_steps + self.settings.model_update_every)
+        return jnp.any(self.real_ratios(last, state) < 1)
+
     def begin_epoch(self, counters: Counters, state: SeedState) -> SeedState:
         """Clears the epoch's sums when an epoch begins."""
         fresh = counters.env_steps % self.settings.epoch_steps == 0

@@ -103,10 +103,8 @@ def begin_stride(algorithm: Algorithm, state: TrainState) -> tuple[TrainState, j
     advanced, keys = split_keys(seeds, 1)
     seeds = seeds.replace(key=jnp.where(into_period == 0, advanced.key, seeds.key))
     seeds = over_seeds(algorithm.begin_epoch)(counters, seeds)
-    # λ may fall from 1 within the period (it never rises in one): what it then draws from must be there.
-    last = counters._replace(env_steps=counters.env_steps + algorithm.settings.model_update_every)
-    only_real = jnp.all(over_seeds(algorithm.real_ratios)(last, seeds) >= 1, axis=1)
-    imagining = (into_period == 0) & learning & algorithm.layout.any_seed(~only_real)
+    needed = algorithm.layout.any_seed(over_seeds(algorithm.imagines)(counters, seeds))
+    imagining = (into_period == 0) & learning & needed
     seeds = over_seeds(lambda c, s, k: algorithm.refresh(c, s, imagining, k))(counters, seeds, keys[:, 0])
     counters = counters._replace(imagined_rows=algorithm.imagined_rows(counters, imagining))
     return state.replace(counters=counters, seeds=seeds), learning
