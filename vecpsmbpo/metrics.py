@@ -141,7 +141,7 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
                 "train_episodes": int(episodes),
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
-                "real_ratio": _number(np.mean(ratios[seed], dtype=np.float64)),
+                "real_ratio": _number(np.asarray(ratios[seed], np.float64).mean()),
                 "temperature": _number(seeds.hyper.temperature[seed]),
             }
         )
