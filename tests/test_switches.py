@@ -93,7 +93,7 @@ def _bandit(gains, counts):
 
 def _credited(*episodes):
     """What is known of four arms after these: arm and return each."""
-    bandit = mixture.init(tiny(real_ratio_schedule="bandit", real_ratio_arms=list(ARMS), n_policies=4))
+    bandit = mixture.init(tiny(real_ratio_schedule="bandit", real_ratio_arms=list(ARMS)))
     for arm, episode_return in episodes:
         bandit = mixture.credit(bandit, arm, jnp.float32(episode_return))
     return bandit

@@ -20,7 +20,8 @@ Curves = dict[str, list[list[metrics.Line]]]  # the epochs of every seed, by how
 
 
 def _read(run_dir: Path) -> tuple[Settings, Curves]:
-    """
+    """A run's settings and epochs.
+
     Raises:
         SettingError: there is no such run, none of its epochs is over, or it is not of the kind that is drawn.
     """

@@ -75,7 +75,6 @@ class Algorithm(ABC):
         settings, spec, layout = self.settings, self.spec, self.layout
         key, model_key, agent_key, draw_key = jax.random.split(key, 4)
         members = posterior.init(settings.n_members)
-        bandit = mixture.init(settings) if settings.adapts_real_ratio else None
         size = spec.obs_size + spec.action_size
         ring = replay.init(imagination.ring_capacity(settings), spec.obs_size, spec.action_size)
         return SeedState(
@@ -91,7 +90,7 @@ class Algorithm(ABC):
             posterior=members,
             episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
             memory=self.memory(),
-            bandit=bandit,
+            bandit=mixture.init(settings) if settings.adapts_real_ratio else None,
             epoch_return=jnp.zeros(()),
             epoch_episodes=jnp.zeros(()),
         )
