@@ -129,6 +129,28 @@ def test_only_the_acting_member_is_credited_and_only_when_it_counts():
     np.testing.assert_array_equal(earned.returns, [0, 0, 5])
 
 
+def _after(*episodes):
+    """What four members have earned after these episodes: member and return of each."""
+    earned = posterior.init(4)
+    for member, episode_return in episodes:
+        earned = posterior.credit(earned, jnp.int32(member), jnp.float32(episode_return), jnp.bool_(True))
+    return earned
+
+
+@pytest.mark.parametrize(
+    ("episodes", "best"),
+    [
+        ([(0, -50.0), (1, -10.0), (2, -30.0), (1, -12.0)], 1),  # by the sum: member 3, which never acted
+        ([(1, 100.0)] * 8 + [(2, 150.0)] * 5, 2),  # by the sum: whoever acted most
+        ([(1, 100.0)] * 8 + [(2, 900.0)], 1),  # 9 episodes, 2.25 for each: one is not half as many, ...
+        ([(1, 100.0)] * 7 + [(2, 900.0)], 2),  # ... of 8 it is
+        ([], 0),
+    ],
+)
+def test_the_best_member_earns_most_per_episode_of_enough(episodes, best):
+    assert int(posterior.best(_after(*episodes))) == best
+
+
 def test_tanh_gaussian_density_against_scipy(key):
     loc, scale = jnp.array([0.3, -1.5, 0.0]), jnp.array([0.5, 0.1, 2.0])
     keys = jax.random.split(key, 200)
@@ -250,6 +272,17 @@ def test_longer_rollouts_start_from_fewer_states_and_are_never_cut():
         starts = chunk * int(imagination.chunks_per_refresh(settings, jnp.int32(horizon)))
         assert starts == (100_000 if horizon <= 10 else capacity // (horizon * chunk) * chunk)
         assert starts * horizon <= capacity
+
+
+def test_policies_learn_from_the_rows_of_one_epoch_of_refreshes_at_the_horizons_they_had():
+    """Four refreshes of 100 starts in an epoch; the horizon grows from 1 to 2 at step 26,000."""
+    settings = tiny(
+        epoch_steps=1000, model_update_every=250, total_steps=1000, warmup_steps=100, rollout_starts=100,
+        horizon_first=1, horizon_last=15, horizon_ramp_start=20, horizon_ramp_end=100,
+    )  # fmt: skip
+    # Steps that learn after a refresh at 25,000, 25,750, 26,000, 26,000 (the last of its period), 26,250, 26,750.
+    steps = {25_250: 400, 26_000: 400, 26_001: 500, 26_250: 500, 26_251: 600, 26_751: 800, 27_000: 800}
+    assert {t: int(imagination.retained_rows(settings, jnp.int32(t))) for t in steps} == steps
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def best(posterior: Posterior) -> jax.Array:
     counts, member 0.
     """
     episodes = posterior.episodes
-    mean = (posterior.returns - posterior.compensation) / jnp.maximum(episodes, 1)
+    mean = posterior.returns / jnp.maximum(episodes, 1)
     enough = (episodes > 0) & (2 * episodes * episodes.shape[0] >= jnp.sum(episodes))
     return jnp.argmax(jnp.where(enough, mean, -jnp.inf))
 
