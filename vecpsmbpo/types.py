@@ -257,6 +257,8 @@ class SeedState(struct.PyTreeNode):
         models: `Model` with leading [N].
         agents: `Agent`, or what another algorithm has for it, with leading [P].
         real: [C, F], D_E: packed transitions, a ring.
+        newest: [F], the row that `real` received last; zeros before the first. (Reading it from a ring that is written
+            in the same step makes XLA copy the ring.)
         imagined: [P, C_M, F], D_M^{n,m}: one ring per member.
         moments: of D_E, for whitening.
         posterior, episode: who acts, and how it is going.
@@ -272,6 +274,7 @@ class SeedState(struct.PyTreeNode):
     models: Model
     agents: Any
     real: jax.Array
+    newest: jax.Array
     imagined: jax.Array
     moments: Moments
     posterior: Posterior

@@ -85,6 +85,7 @@ class Algorithm(ABC):
             ),
             agents=jax.vmap(self.init_agent)(layout.keys(agent_key, layout.member_ids())),
             real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
+            newest=ring[0],
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
             moments=Moments(jnp.zeros(size + spec.obs_size), jnp.zeros(size + spec.obs_size), inputs=size),
             posterior=members,
@@ -125,7 +126,7 @@ class Algorithm(ABC):
         Where something in it is not finite, the episode ends before it, truncated, with the return so far.
         """
         episode, bandit = state.episode, state.bandit
-        row, sound = self._row(counters, state, transition)
+        row, sound = self._row(state, transition)
         total = episode.episode_return + jnp.where(sound, transition.reward, 0.0)
         length = episode.length + 1
         terminated = (transition.terminated > 0) & sound
@@ -152,6 +153,7 @@ class Algorithm(ABC):
         running = episode.replace(episode_return=total, length=length)
         state = state.replace(
             real=replay.add(state.real, row[None], counters.env_steps),
+            newest=row,
             moments=_welford(state.moments, self._unpack(row), counters.env_steps),
             posterior=members,
             episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
@@ -164,7 +166,7 @@ class Algorithm(ABC):
         )
         return state, end
 
-    def _row(self, counters: Counters, state: SeedState, transition: Transition) -> tuple[jax.Array, jax.Array]:
+    def _row(self, state: SeedState, transition: Transition) -> tuple[jax.Array, jax.Array]:
         """The row [F] to store for a transition, and whether it is the transition: [] bool.
 
         One that is not finite is never stored. Since every seed adds a row per step, the last good one is stored again;
@@ -172,7 +174,7 @@ class Algorithm(ABC):
         """
         row = replay.pack(transition)
         sound = jnp.all(jnp.isfinite(row))
-        return jnp.where(sound, row, replay.newest(state.real, counters.env_steps)), sound
+        return jnp.where(sound, row, state.newest), sound
 
     def _unpack(self, rows: jax.Array) -> Transition:
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
