@@ -78,15 +78,16 @@ def test_predictions_are_drawn_with_the_network_s_variance(key):
 
 
 def test_whitening_uses_the_data_s_mean_and_standard_deviation():
-    rows = np.random.default_rng(0).normal(5.0, 3.0, size=(40, 3))
+    rows = np.random.default_rng(0).normal(5.0, 3.0, size=(40, 4))  # obs, action, Δs, r
     rows[:, 1] = 7.0  # never varies: left unscaled
-    moments = Moments(jnp.asarray(rows.mean(0)), jnp.asarray(((rows - rows.mean(0)) ** 2).sum(0)), inputs=2)
-    mean, std, changes = dynamics.scaling(moments, jnp.int32(40), tiny())
+    deviation = jnp.asarray(((rows - rows.mean(0)) ** 2).sum(0))
+    moments = Moments(jnp.asarray(rows.mean(0)), deviation, jnp.zeros(()), jnp.zeros(()), inputs=2)
+    mean, std, outputs = dynamics.scaling(moments, jnp.int32(40), tiny(recipe="paper"))
     np.testing.assert_allclose(mean, rows.mean(0)[:2], rtol=1e-5)
     np.testing.assert_allclose(std, [rows[:, 0].std(), 1.0], rtol=1e-5)
-    np.testing.assert_array_equal(changes, [1, 1])  # A.1: as they are
-    _, _, changes = dynamics.scaling(moments, jnp.int32(40), tiny(whiten_targets=True))
-    np.testing.assert_allclose(changes, [rows[:, 2].std(), 1.0], rtol=1e-5)
+    np.testing.assert_array_equal(outputs, [1, 1])  # A.1: as they are
+    _, _, outputs = dynamics.scaling(moments, jnp.int32(40), tiny(whiten_targets=True))
+    np.testing.assert_allclose(outputs, rows[:, 2:].std(0), rtol=1e-5)
 
 
 def test_optimistic_probabilities_by_hand():

@@ -40,6 +40,7 @@ class Settings:
     env_options: Options = ()
     algo: str
     size: str
+    recipe: str
     backend: str = _choice("auto", "mjx", "host")
     seed: int = _whole(0, 2**31 - 1)
     num_seeds: int = _whole(1)
@@ -90,6 +91,10 @@ class Settings:
     discount: float = _real(0, 1)
     target_entropy: float = _real()
     target_update_rate: float = _real(0, 1, open_low=True)
+    target_update_every: int = _whole(1)
+    critic_norm: str = _choice("none", "layer", "rms")
+    clip_targets: bool
+    bound_log_prob: bool
     # model and policy in turns (SLBO)
     rounds: int = _whole(1)
     model_steps: int = _whole(1)

@@ -218,14 +218,18 @@ class EpisodeEnd(struct.PyTreeNode):
 
 
 class Moments(struct.PyTreeNode):
-    """Running mean and sum of squared deviations of (observation, action, Δs) over D_E, [2 O + A] each (Welford).
+    """Running moments of (observation, action, Δs, r) over D_E (Welford).
 
     Attributes:
+        mean, deviation: [2 O + A + 1] each; a deviation is a sum of squares.
+        lowest_reward, highest_reward: [], of D_E and 0.
         inputs: O + A.
     """
 
     mean: jax.Array
     deviation: jax.Array
+    lowest_reward: jax.Array
+    highest_reward: jax.Array
     inputs: int = struct.field(pytree_node=False)
 
 

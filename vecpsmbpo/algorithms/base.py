@@ -86,7 +86,7 @@ class Algorithm(ABC):
             agents=jax.vmap(self.init_agent)(layout.keys(agent_key, layout.member_ids())),
             real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
-            moments=Moments(jnp.zeros(size + spec.obs_size), jnp.zeros(size + spec.obs_size), inputs=size),
+            moments=_no_moments(size, spec.obs_size),
             posterior=members,
             episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
             memory=self.memory(),
@@ -209,9 +209,21 @@ class Algorithm(ABC):
         return state.replace(models=fitted)
 
 
+def _no_moments(inputs: int, obs_size: int) -> Moments:
+    """Of no rows."""
+    zeros, zero = jnp.zeros(inputs + obs_size + 1), jnp.zeros(())
+    return Moments(zeros, zeros, lowest_reward=zero, highest_reward=zero, inputs=inputs)
+
+
 def _welford(moments: Moments, transition: Transition, rows: jax.Array) -> Moments:
     """Moments of one more row after `rows` of them."""
-    value = jnp.concatenate([transition.obs, transition.action, transition.next_obs - transition.obs])
+    obs, action, reward, next_obs, _ = transition
+    value = jnp.concatenate([obs, action, next_obs - obs, reward[None]])
     change = value - moments.mean
     mean = moments.mean + change / (rows + 1)
-    return moments.replace(mean=mean, deviation=moments.deviation + change * (value - mean))
+    return moments.replace(
+        mean=mean,
+        deviation=moments.deviation + change * (value - mean),
+        lowest_reward=jnp.minimum(moments.lowest_reward, reward),
+        highest_reward=jnp.maximum(moments.highest_reward, reward),
+    )

@@ -151,8 +151,12 @@ class PsMbpo(Algorithm):
             state.imagined, ratios, layout.keys(batch_key, ids)
         )
 
+        settings, moments = self.settings, state.moments
+        limits = sac.Limits(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
+        every = settings.target_update_every
+
         def update(agent, batches, key):
-            return sac.updates(agent, batches, state.hyper, key, nets=nets)
+            return sac.updates(agent, batches, state.hyper, key, nets=nets, limits=limits, target_every=every)
 
         return layout.map_local(update, state.agents, batches, layout.keys(update_key, ids))
 
