@@ -35,7 +35,7 @@ class Layout:
         n_models: N.
         n_policies: M.
         n_members: N·M, or M where policies do not belong to models.
-        sequential: members of one device run one after the other (`lax.map`) instead of batched (`vmap`). On a CPU
+        sequential: members of one device, of one seed and of all, run one after the other instead of batched. On a CPU
             core, whose cache holds one member's parameters but not all of them, this is faster; the arithmetic is the
             same.
     """
@@ -99,11 +99,25 @@ class Layout:
         """A key per model or member that depends on its index and not on the mesh."""
         return jax.vmap(partial(jax.random.fold_in, key))(ids)
 
-    def map_local(self, function: Callable, *batched: Any) -> Any:
-        """`function` of one model or member, applied to each of this device's."""
-        if self.sequential:
-            return jax.lax.map(lambda args: function(*args), batched)
-        return jax.vmap(function)(*batched)
+    def map_local(self, function: Callable, *batched: Any, shared: tuple = ()) -> Any:
+        """`function` of (what one model or member has, ..., *shared), applied to each of this device's.
+
+        Where they run one after the other, so do the seeds that this is then batched over: XLA adds along the rows of
+        [256, 64] four times as fast as along those of [1, 256, 64], and a fit that has stopped need not wait for the
+        fits of other seeds.
+
+        Args:
+            batched: leaves [N_local, ...] or [P_local, ...].
+            shared: what `function` needs of its seed otherwise; it must not close over any of it.
+        """
+        if not self.sequential:
+            return jax.vmap(lambda *one: function(*one, *shared))(*batched)
+
+        @jax.custom_batching.sequential_vmap
+        def loop(batched: Any, shared: Any) -> Any:
+            return jax.lax.map(lambda one: function(*one, *shared), batched)
+
+        return loop(batched, shared)
 
     def models_of_members(self, models: Any) -> Any:
         """This device's models [N_local, ...] -> for each of its members the model that it learns in [P_local, ...]."""

@@ -198,15 +198,15 @@ class Algorithm(ABC):
         split = dynamics.Split.draw(split_key, rows, settings.replay_capacity, settings.validation_block)
         whitening = dynamics.scaling(state.moments, rows, settings)
 
-        def fit(model, key):
-            return dynamics.fit(model, state.real, split, whitening, state.hyper, key, settings=settings, spec=spec)
+        def fit(model, key, real, split, whitening, hyper):
+            return dynamics.fit(model, real, split, whitening, hyper, key, settings=settings, spec=spec)
 
-        keys = self.layout.keys(fit_key, self.layout.model_ids())
+        def fitted(models):
+            keys = self.layout.keys(fit_key, self.layout.model_ids())
+            return self.layout.map_local(fit, models, keys, shared=(state.real, split, whitening, state.hyper))
+
         # Only the models go through the branch: see `drivers.common.observe_and_learn`.
-        fitted = jax.lax.cond(
-            enabled, lambda models: self.layout.map_local(fit, models, keys), lambda x: x, state.models
-        )
-        return state.replace(models=fitted)
+        return state.replace(models=jax.lax.cond(enabled, fitted, lambda models: models, state.models))
 
 
 def _no_moments(inputs: int, obs_size: int) -> Moments:

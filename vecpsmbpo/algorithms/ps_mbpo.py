@@ -106,26 +106,27 @@ class PsMbpo(Algorithm):
         shared = settings.rollout_models == "any"
         models = (layout.all_models_for_members if shared else layout.models_of_members)(state.models)
 
-        def real_states(key):
-            return imagination.start_states(state.real, counters.env_steps, key, chunk, spec)
+        def real_states(keys):
+            """[P_local] -> [P_local, chunk, O]; for all members at once, as `learn` draws minibatches."""
+            return jax.vmap(lambda key: imagination.start_states(state.real, counters.env_steps, key, chunk, spec))(
+                keys
+            )
 
-        def advance(model, actor, obs, key):
-            step_key, fresh_key = jax.random.split(key)
-            transition = imagination.step(model, actor, obs, step_key, settings=settings, spec=spec)
-            ended = transition.terminated[:, None]
-            return replay.pack(transition), jnp.where(ended, real_states(fresh_key), transition.next_obs)
+        def advance(model, actor, obs, fresh, key):
+            transition = imagination.step(model, actor, obs, key, settings=settings, spec=spec)
+            return replay.pack(transition), jnp.where(transition.terminated[:, None], fresh, transition.next_obs)
 
         def step(t, carry):
             imagined, obs, rows, key = carry
-            rows_now, obs = layout.map_local(
-                advance, models, state.agents.actor, obs, layout.keys(jax.random.fold_in(key, t), ids)
-            )
+            keys = jax.vmap(jax.random.split)(layout.keys(jax.random.fold_in(key, t), ids))
+            fresh = real_states(keys[:, 1])
+            rows_now, obs = layout.map_local(advance, models, state.agents.actor, obs, fresh, keys[:, 0])
             return replay.add(imagined, rows_now, rows), obs, rows + chunk, key
 
         def rollout(c, carry):
             imagined, rows = carry
             start_key, step_key = jax.random.split(jax.random.fold_in(key, c))
-            obs = jax.vmap(real_states)(layout.keys(start_key, ids))
+            obs = real_states(layout.keys(start_key, ids))
             imagined, _, rows, _ = jax.lax.fori_loop(0, horizon, step, (imagined, obs, rows, step_key))
             return imagined, rows
 
@@ -153,12 +154,13 @@ class PsMbpo(Algorithm):
 
         settings, moments = self.settings, state.moments
         limits = sac.Limits(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
-        every = settings.target_update_every
 
-        def update(agent, batches, key):
-            return sac.updates(agent, batches, state.hyper, key, nets=nets, limits=limits, target_every=every)
+        def update(agent, batches, key, hyper, limits):
+            every = settings.target_update_every
+            return sac.updates(agent, batches, hyper, key, nets=nets, limits=limits, target_every=every)
 
-        return layout.map_local(update, state.agents, batches, layout.keys(update_key, ids))
+        keys = layout.keys(update_key, ids)
+        return layout.map_local(update, state.agents, batches, keys, shared=(state.hyper, limits))
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings
