@@ -55,7 +55,8 @@ def watched() -> Iterator[None]:
         yield
     finally:
         end()
-        os.waitpid(watcher, 0)
+        with contextlib.suppress(ChildProcessError):  # it ended before, and where SIGCHLD is ignored leaves no trace
+            os.waitpid(watcher, 0)
 
 
 def doing(what: str, run_dir: Path | None = None) -> None:
