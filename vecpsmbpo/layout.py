@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from vecpsmbpo.settings import Settings
@@ -177,7 +178,8 @@ class Layout:
         """`function` of a device's part, jitted over the whole mesh."""
         # Replication along `members` holds by construction (equal inputs, equal programs); jax's static check of it
         # cannot follow MJX's while loops.
-        body = jax.shard_map(function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
+        body = _making_empty_arrays(function)
+        body = jax.shard_map(body, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
         # Shardings are stated, not inferred, so that a fresh and a resumed run are one program to the cache.
         return jax.jit(body, in_shardings=self._placed(in_specs), out_shardings=self._placed(out_specs), **jit)
 
@@ -258,6 +260,25 @@ class Layout:
             part = part.reshape(sharding.shard_shape(like.shape))
             parts += [jax.device_put(part, device) for device in devices]
         return jax.make_array_from_single_device_arrays(like.shape, sharding, parts)
+
+
+def _making_empty_arrays(function: Callable) -> Callable:
+    """`function`, but it makes the arrays without elements itself that it is given or closes over.
+
+    An MJX model is full of them: there is one for every kind of joint, tendon and contact that it has not. The compiler
+    of jax 0.11 crashes where the body of a `shard_map` reads one that comes from outside (docs/architecture.md).
+    """
+
+    def made_here(x: Any) -> Any:
+        return x if x.size else jnp.zeros_like(x)
+
+    def body(*args: Any) -> Any:
+        args = jax.tree.map(made_here, args)
+        traced, result = jax.make_jaxpr(function, return_shape=True)(*args)
+        traced = ClosedJaxpr(traced.jaxpr, [made_here(x) for x in traced.consts])
+        return jax.tree.unflatten(jax.tree.structure(result), jaxpr_as_fun(traced)(*jax.tree.leaves(args)))
+
+    return body
 
 
 def _mesh_shape(lanes: int, parts: int, most: int) -> tuple[int, int]:
