@@ -10,6 +10,7 @@ Taking a truncation for a termination, or the observation after a reset for the 
 
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -80,3 +81,52 @@ class ProbeSimulator(Simulator):
 
 def host(terminates: bool, *, num_envs: int, seed: int) -> HostEnv:
     return HostEnv(spec(terminates), [ProbeSimulator(terminates) for _ in range(num_envs)])
+
+
+# ── that return NaN or infinity now and then, at a reset or at a step ───────────────────────────────────────────
+
+
+class FailingProbe(Probe):
+    """Of a JAX environment only its state is kept: an episode draws the step at which it fails, from 0 (its reset)."""
+
+    def __init__(self):
+        super().__init__(terminates=False)
+
+    def reset(self, rng: jax.Array) -> State:
+        fails_at = jax.random.randint(rng, (), 0, 3 * EPISODE_LENGTH)
+        return super().reset(rng).replace(pipeline_state=fails_at, obs=jnp.where(fails_at == 0, jnp.nan, jnp.zeros(1)))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        left = state.pipeline_state - 1
+        after = super().step(state.replace(obs=jnp.nan_to_num(state.obs)), action)
+        fails = left == 0
+        obs = jnp.where(fails & (action[0] > 0), jnp.nan, after.obs)
+        reward = jnp.where(fails & (action[0] <= 0), jnp.inf, after.reward)
+        return after.replace(pipeline_state=left, obs=obs, reward=reward)
+
+
+class FailingGymnasium(gymnasium.Env):
+    """Every seventh step and every twentieth reset fails; the seed says where it begins to count."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self):
+        self.obs, self.steps, self.resets = 0.0, 0, 0
+
+    @staticmethod
+    def termination_rule(obs, action, next_obs):
+        return spec(False).terminated(obs, action, next_obs)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = self.steps if seed is None else seed % 7
+        self.obs, self.resets = 0.0, self.resets + 1
+        return np.array([0.0 if self.resets % 20 else np.nan]), {}
+
+    def step(self, action):
+        reward = self.obs * (1 - float(action[0]) ** 2)
+        self.obs, self.steps = 1 - self.obs, self.steps + 1
+        fails = self.steps % 7 == 0
+        obs = np.array([1e39 if fails and action[0] > 0 else self.obs])  # infinite in float32
+        return obs, -np.inf if fails and action[0] <= 0 else reward, False, False, {}

@@ -12,6 +12,7 @@ from tests import probes
 from tests.helpers import algorithm, assert_probabilities_follow, tiny
 from vecpsmbpo import metrics, replay, sac
 from vecpsmbpo.drivers import HostDriver, ScanDriver
+from vecpsmbpo.drivers.common import split_for_episodes
 from vecpsmbpo.train import evaluation_keys, initial_inputs
 
 DISCOUNT = 0.5
@@ -205,14 +206,13 @@ def test_seeds_differ_and_are_what_they_are_alone(algo):
 
 
 def _four_policies(settings, driver):
-    """A state in which policy i always acts tanh(i / 4), give or take 1e-3, and the second has earned the most, which
-    is the best of them at any temperature."""
+    """A state in which policy i always acts tanh(i / 4), give or take 1e-3, and the second has earned the most."""
     state = driver.init(*initial_inputs(settings))
     assert driver.algorithm.spec.action_size == 1
     actor = jax.tree.map(jnp.zeros_like, state.seeds.agents.actor)
     bias = jnp.stack([jnp.array([i / 4, -1e3]) for i in range(4)])[None]
     actor["params"]["ReluMLP_0"]["Dense_2"]["bias"] = bias
-    posterior = state.seeds.posterior.replace(returns=jnp.array([[0.0, 9e9, 0, 0]]))
+    posterior = state.seeds.posterior.replace(returns=jnp.array([[0.0, 9e9, 0, 0]]), episodes=jnp.ones((1, 4), int))
     seeds = state.seeds.replace(agents=state.seeds.agents.replace(actor=actor), posterior=posterior)
     return driver.layout.place(state.replace(seeds=seeds))
 
@@ -250,6 +250,20 @@ def test_the_average_of_policies_is_evaluated_as_it_acts():
     assert nearest.max(axis=0).min() > 0.1
     assert nearest.min(axis=1).max() < 1e-4
     assert set(nearest.argmin(axis=1)) == {0, 1, 2, 3}
+
+
+def test_no_key_of_an_evaluation_is_used_twice(key):
+    """Whatever a reset splits its key into, no step's action is drawn with it; nor with another episode's."""
+    _, resets, actions = split_for_episodes(key[None], 3)
+    of_resets = [jax.vmap(lambda k, count=count: jax.random.split(k, count))(resets[0]) for count in (2, 4)]
+    of_steps = jax.vmap(lambda k: jax.vmap(lambda t: jax.random.fold_in(k, t))(jnp.arange(5)))(actions[0])
+    used = {tuple(row) for keys in of_resets for row in np.asarray(jax.random.key_data(keys)).reshape(-1, 2)}
+    steps = {tuple(row) for row in np.asarray(jax.random.key_data(of_steps)).reshape(-1, 2)}
+    assert len(steps) == 15
+    assert not steps & used
+    assert {
+        len({tuple(row) for row in np.asarray(jax.random.key_data(k)).reshape(-1, 2)}) for k in (resets, actions)
+    } == {3}
 
 
 @pytest.mark.parametrize(("policy", "members"), [("best", {1}), ("average", {0, 1, 2, 3})])

@@ -92,18 +92,18 @@ def test_whitening_uses_the_data_s_mean_and_standard_deviation():
 
 def test_optimistic_probabilities_by_hand():
     # Equation 19: returns 100, 300, 300, 0 at τ = 100: e^1, e^3, e^3, e^0 over their sum 43.8894.
-    earned = Posterior(jnp.array([100.0, 300.0, 300.0, 0.0]), jnp.zeros(4))
+    earned = Posterior(jnp.array([100.0, 300.0, 300.0, 0.0]), jnp.zeros(4), jnp.zeros(4, int))
     expected = np.exp([1, 3, 3, 0]) / np.exp([1, 3, 3, 0]).sum()
     np.testing.assert_allclose(jax.nn.softmax(posterior.logits(earned, 100.0)), expected, rtol=1e-6)
 
 
 def test_infinite_temperature_is_uniform():
-    earned = Posterior(jnp.array([1e6, 0.0, -1e6]), jnp.zeros(3))
+    earned = Posterior(jnp.array([1e6, 0.0, -1e6]), jnp.zeros(3), jnp.zeros(3, int))
     np.testing.assert_array_equal(jax.nn.softmax(posterior.logits(earned, jnp.inf)), np.full(3, 1 / 3, np.float32))
 
 
 def test_members_are_drawn_with_the_probabilities_of_equation_19():
-    earned = Posterior(jnp.array([10.0, 20.0, 0.0, 15.0]), jnp.zeros(4))
+    earned = Posterior(jnp.array([10.0, 20.0, 0.0, 15.0]), jnp.zeros(4), jnp.zeros(4, int))
     keys = jax.random.split(jax.random.key(1), 20_000)
     members, probs = jax.vmap(lambda key: posterior.draw(earned, jnp.float32(10.0), key))(keys)
     counts = np.bincount(members, minlength=4)
@@ -128,6 +128,28 @@ def test_only_the_acting_member_is_credited_and_only_when_it_counts():
     earned = posterior.credit(posterior.init(3), jnp.int32(2), jnp.float32(5.0), jnp.bool_(True))
     earned = posterior.credit(earned, jnp.int32(0), jnp.float32(7.0), jnp.bool_(False))
     np.testing.assert_array_equal(earned.returns, [0, 0, 5])
+
+
+def _after(*episodes):
+    """What four members have earned after these episodes: member and return of each."""
+    earned = posterior.init(4)
+    for member, episode_return in episodes:
+        earned = posterior.credit(earned, jnp.int32(member), jnp.float32(episode_return), jnp.bool_(True))
+    return earned
+
+
+@pytest.mark.parametrize(
+    ("episodes", "best"),
+    [
+        ([(0, -50.0), (1, -10.0), (2, -30.0), (1, -12.0)], 1),  # by the sum: member 3, which never acted
+        ([(1, 100.0)] * 8 + [(2, 150.0)] * 5, 2),  # by the sum: whoever acted most
+        ([(1, 100.0)] * 8 + [(2, 900.0)], 1),  # 9 episodes, 2.25 for each: one is not half as many, ...
+        ([(1, 100.0)] * 7 + [(2, 900.0)], 2),  # ... of 8 it is
+        ([], 0),
+    ],
+)
+def test_the_best_member_earns_most_per_episode_of_enough(episodes, best):
+    assert int(posterior.best(_after(*episodes))) == best
 
 
 def test_tanh_gaussian_density_against_scipy(key):
@@ -251,6 +273,17 @@ def test_longer_rollouts_start_from_fewer_states_and_are_never_cut():
         starts = chunk * int(imagination.chunks_per_refresh(settings, jnp.int32(horizon)))
         assert starts == (100_000 if horizon <= 10 else capacity // (horizon * chunk) * chunk)
         assert starts * horizon <= capacity
+
+
+def test_policies_learn_from_the_rows_of_one_epoch_of_refreshes_at_the_horizons_they_had():
+    """Four refreshes of 100 starts in an epoch; the horizon grows from 1 to 2 at step 26,000."""
+    settings = tiny(
+        epoch_steps=1000, model_update_every=250, total_steps=1000, warmup_steps=100, rollout_starts=100,
+        horizon_first=1, horizon_last=15, horizon_ramp_start=20, horizon_ramp_end=100,
+    )  # fmt: skip
+    # Steps that learn after a refresh at 25,000, 25,750, 26,000, 26,000 (the last of its period), 26,250, 26,750.
+    steps = {25_250: 400, 26_000: 400, 26_001: 500, 26_250: 500, 26_251: 600, 26_751: 800, 27_000: 800}
+    assert {t: int(imagination.retained_rows(settings, jnp.int32(t))) for t in steps} == steps
 
 
 @pytest.mark.parametrize(

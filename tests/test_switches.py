@@ -249,17 +249,21 @@ def test_with_the_average_no_member_acts_or_is_credited(averaged):
 
 
 def test_swept_values_run_side_by_side(averaged):
-    """Of 240 episodes after the warm-up, none is random at τ = 0; at 60 those with probability min(1, 60 / k)."""
+    """Of 240 episodes after the warm-up, none is random at τ = 0; at 60 those with probability min(1, 60 / k), where
+    the first of them has k = 1."""
     settings, _, state, lines, epochs = averaged
     assert [lane["forced_exploration"] for lane in settings.lanes] == [0.0, 60.0]
     np.testing.assert_array_equal(state.seeds.hyper.forced_exploration, [0.0, 60.0])
     assert [(line["seed"], line["forced_exploration"]) for line in epochs[:2]] == [(0, 0.0), (0, 60.0)]
     late = {
-        value: [line for line in lines if line["forced_exploration"] == value and line["env_steps"] > 122]
+        value: [line for line in lines if line["forced_exploration"] == value and line["env_steps"] >= 122]
         for value in (0.0, 60.0)
     }
     assert not any(line["random"] for line in late[0.0])
-    chances = np.array([min(1, 60 / line["episode"]) for line in late[60.0]])
+    # Episodes of two steps: the 60 of the warm-up begin before its 120th.
+    assert [line["episode"] for line in late[60.0]] == list(range(61, 301))
+    assert all(line["random"] for line in late[60.0][:60])
+    chances = np.array([min(1, 60 / (line["episode"] - 60)) for line in late[60.0]])
     count = sum(line["random"] for line in late[60.0])
     assert abs(count - chances.sum()) < 4 * np.sqrt((chances * (1 - chances)).sum())
 

@@ -16,6 +16,7 @@ from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import TrainState
 
 _log = logging.getLogger(__name__)
+FORMAT = 2  # of what is saved; a state that gains or loses fields is another one
 KEPT = 2  # the newest and the one before it, should the newest be damaged
 IN_FLIGHT_GB = 0.2  # being written or read at a time
 CHUNK_BYTES = 32 * 2**20  # of one file
@@ -72,6 +73,7 @@ class Checkpoints:
             self._manager.delete(self._damaged.pop())
         plain = _to_host(state, layout)
         chunks = jax.tree.map(lambda _: ocp.SaveArgs(chunk_byte_size=CHUNK_BYTES), plain)
+        host = {**host, "format": FORMAT}
         items = ocp.args.Composite(state=ocp.args.PyTreeSave(plain, save_args=chunks), host=ocp.args.JsonSave(host))
         self._manager.save(step, args=items, force=True)
         self._manager.wait_until_finished()
@@ -85,13 +87,13 @@ class Checkpoints:
             shapes: of the train state, as `jax.eval_shape` of its initialisation gives them.
 
         Raises:
-            SettingError: there are checkpoints, and none can be read.
+            SettingError: there are checkpoints, and none can be read, or an older version of this program wrote them.
         """
         reason: Exception | None = None
         for step in reversed(self.steps()):
             try:
                 items = self._read(step, shapes, layout)
-            except MemoryError:
+            except (MemoryError, SettingError):
                 raise
             except Exception as error:  # whatever a damaged file makes orbax raise
                 _log.debug("checkpoint %d", step, exc_info=error)
@@ -106,6 +108,9 @@ class Checkpoints:
         return None
 
     def _read(self, step: int, shapes: TrainState, layout: Layout) -> Any:
+        host = self._manager.restore(step, args=ocp.args.Composite(host=ocp.args.JsonRestore()))["host"]
+        if host.get("format") != FORMAT:
+            raise SettingError(f"{self._directory}: is of another version of this program and cannot be gone on from")
         plain = _shapes_on_host(shapes, layout)
         as_array = jax.tree.map(lambda x: ocp.ArrayRestoreArgs(restore_type=np.ndarray), plain)
         state = ocp.args.PyTreeRestore(plain, restore_args=as_array)
@@ -119,7 +124,7 @@ class Checkpoints:
 
 
 def _to_host(state: TrainState, layout: Layout) -> dict[str, Any]:
-    rest = jax.tree.map(lambda x: np.asarray(_storable(x)), layout.unpad(_without_rings(state)))
+    rest = jax.tree.map(lambda x: np.asarray(_storable(x)), layout.unpad(state.without_rings()))
     real = layout.rings_to_host(state.seeds.real)
     imagined = layout.rings_to_host(state.seeds.imagined, layout.n_members)
     return {"rest": rest, "real": real, "imagined": imagined}
@@ -131,14 +136,14 @@ def _shapes_on_host(shapes: TrainState, layout: Layout) -> dict[str, Any]:
     def rings(like: Any, count: int) -> list[Any]:
         return [jax.ShapeDtypeStruct(like.shape[-2:], like.dtype)] * count
 
-    rest = jax.eval_shape(lambda state: jax.tree.map(_storable, layout.unpad(state)), _without_rings(shapes))
+    rest = jax.eval_shape(lambda state: jax.tree.map(_storable, layout.unpad(state)), shapes.without_rings())
     seeds, count = shapes.seeds, layout.num_seeds
     return {"rest": rest, "real": rings(seeds.real, count), "imagined": rings(seeds.imagined, count * layout.n_members)}
 
 
 def _from_host(plain: dict[str, Any], shapes: TrainState, layout: Layout) -> TrainState:
     """The inverse of `_to_host`; takes the rings out of `plain`."""
-    rest_shapes = jax.eval_shape(layout.unpad, _without_rings(shapes))
+    rest_shapes = jax.eval_shape(layout.unpad, shapes.without_rings())
     state = layout.place(jax.tree.map(_restored, plain["rest"], rest_shapes))
     specs = layout.specs().seeds
     rings = {
@@ -146,10 +151,6 @@ def _from_host(plain: dict[str, Any], shapes: TrainState, layout: Layout) -> Tra
         for name in ("real", "imagined")
     }
     return state.replace(seeds=state.seeds.replace(**rings))
-
-
-def _without_rings(state: TrainState) -> TrainState:
-    return state.replace(seeds=state.seeds.replace(real=None, imagined=None))
 
 
 def _is_key(x: Any) -> bool:

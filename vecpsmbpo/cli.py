@@ -77,7 +77,7 @@ def _train(overrides: list[str]) -> int:
 
 
 def _run(settings: Settings) -> int:
-    from vecpsmbpo.train import DiskError, Diverged, train
+    from vecpsmbpo.train import DiskError, train
 
     try:
         return train(settings)
@@ -87,16 +87,13 @@ def _run(settings: Settings) -> int:
         # tracebacks of their own, while the interpreter ends.
         crash.end()
         os._exit(2)
-    except Diverged as error:
-        print(f"vecpsmbpo: {error}", file=sys.stderr)
-        return 1
 
 
 def _multirun(overrides: list[str]) -> int:
     """Hydra's own multirun, so that its sweepers and launchers work.
 
-    A run that cannot be made, or diverges, does not take the others with it; the exit status is the worst of all. A
-    signal stops them all.
+    A run that cannot be made, or has frozen lanes, does not take the others with it; the exit status is the worst of
+    all. A signal stops them all.
     """
     import hydra
 

@@ -67,12 +67,17 @@ def rows_per_refresh(settings: Settings, env_steps: jax.Array) -> jax.Array:
 
 
 def retained_rows(settings: Settings, env_steps: jax.Array) -> jax.Array:
-    """How many of the newest rows policies learn from: those of one epoch of refreshes at the current horizon.
+    """How many of the newest rows policies learn from after `env_steps` steps: those of one epoch of refreshes.
 
-    As both MBPO codebases have it: older rows come from models fitted on less data and from policies of long ago.
+    As both MBPO codebases have it: older rows come from models fitted on less data and from policies of long ago. Each
+    refresh counts at the horizon it had. (Where there have been fewer, `added` of `replay.sample_newest_indices` bounds
+    the rows.)
     """
-    rows = rows_per_refresh(settings, env_steps) * settings.refreshes_per_epoch
-    return jnp.minimum(rows, ring_capacity(settings))
+    period = settings.model_update_every
+    # The step that ends a period learns before the next refresh.
+    last = (env_steps - 1) // period * period
+    refreshes = last - period * jnp.arange(settings.refreshes_per_epoch)
+    return jnp.minimum(jnp.sum(rows_per_refresh(settings, refreshes)), ring_capacity(settings))
 
 
 def step(

@@ -161,6 +161,10 @@ class Layout:
         kept = jnp.where(real.reshape(-1, *(1,) * (values.ndim - 1)), values, 0.0)
         return jax.lax.psum(jnp.sum(kept, axis=0), MEMBERS) / self.n_members
 
+    def least_of_members(self, values: jax.Array) -> jax.Array:
+        """The smallest [] of what this and the other devices of the seed have."""
+        return jax.lax.pmin(values, MEMBERS)
+
     def any_seed(self, flags: jax.Array) -> jax.Array:
         """[S_local] bool -> whether any seed, on any device, has it."""
         return jax.lax.pmax(jnp.any(flags).astype(jnp.int32), SEEDS) > 0

@@ -4,6 +4,7 @@ And sessions.jsonl: a line for each time that somebody began, or went on with, t
 """
 
 import json
+import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -77,7 +78,7 @@ def read(path: Path) -> list[Line]:
 
 def _append(path: Path, lines: list[Line]) -> None:
     with path.open("a") as file:
-        file.write("".join(json.dumps(line) + "\n" for line in lines))
+        file.write("".join(_json(line) for line in lines))
         file.flush()
         os.fsync(file.fileno())
 
@@ -85,8 +86,19 @@ def _append(path: Path, lines: list[Line]) -> None:
 def _rewind(path: Path, env_steps: int) -> None:
     kept = [line for line in read(path) if line["env_steps"] <= env_steps]
     beside = path.with_suffix(".tmp")
-    beside.write_text("".join(json.dumps(line) + "\n" for line in kept))
+    beside.write_text("".join(_json(line) for line in kept))
     beside.replace(path)
+
+
+def _json(line: Line) -> str:
+    """A line of a JSONL file. JSON has neither NaN nor infinity: they are null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, list):
+            return [plain(item) for item in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps({name: plain(value) for name, value in line.items()}, allow_nan=False) + "\n"
 
 
 def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[Line]:
@@ -147,6 +159,7 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
                 **_lane(settings, seed),
                 "train_return": float(seeds.epoch_return[seed]) / episodes if episodes else None,
                 "train_episodes": int(episodes),
+                "unsound_steps": int(seeds.epoch_unsound[seed]),
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
                 "real_ratio": _number(np.asarray(ratios[seed], np.float64).mean()),

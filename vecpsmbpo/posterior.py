@@ -7,7 +7,7 @@ from vecpsmbpo.types import Posterior
 
 
 def init(members: int) -> Posterior:
-    return Posterior(returns=jnp.zeros(members), compensation=jnp.zeros(members))
+    return Posterior(jnp.zeros(members), jnp.zeros(members), jnp.zeros(members, jnp.int32))
 
 
 def credit(posterior: Posterior, member: jax.Array, episode_return: jax.Array, counts: jax.Array) -> Posterior:
@@ -16,10 +16,11 @@ def credit(posterior: Posterior, member: jax.Array, episode_return: jax.Array, c
     Compensated (Kahan) addition: after hundreds of episodes of thousands, plain float32 sums would be off by more
     than the 1e-5 to which the probabilities can be recomputed from the log.
     """
-    gain = jnp.where(counts, episode_return, 0.0) * jax.nn.one_hot(member, posterior.returns.shape[0])
-    gain = gain - posterior.compensation
+    credited = (jnp.arange(posterior.returns.shape[0]) == member) & counts
+    gain = jnp.where(credited, episode_return, 0.0) - posterior.compensation
     total = posterior.returns + gain
-    return Posterior(returns=total, compensation=(total - posterior.returns) - gain)
+    compensation = (total - posterior.returns) - gain
+    return Posterior(total, compensation, posterior.episodes + credited)
 
 
 def logits(posterior: Posterior, temperature: jax.Array) -> jax.Array:
@@ -29,8 +30,17 @@ def logits(posterior: Posterior, temperature: jax.Array) -> jax.Array:
 
 
 def best(posterior: Posterior) -> jax.Array:
-    """The member that has earned the most, [] int, whatever the temperature."""
-    return jnp.argmax(logits(posterior, jnp.float32(1.0)))
+    """The member of highest mean return, [] int, of those that acted in enough episodes to tell.
+
+    Enough are half as many as there would be had all members acted equally often, and at least one: the mean of the
+    fewest is then at most √2 times as uncertain as that of an average member, and some member always has them. (The sum
+    of equation 19 says who acted often and, where returns are negative, who did not.) Before the first episode that
+    counts, member 0.
+    """
+    episodes = posterior.episodes
+    mean = posterior.returns / jnp.maximum(episodes, 1)
+    enough = (episodes > 0) & (2 * episodes * episodes.shape[0] >= jnp.sum(episodes))
+    return jnp.argmax(jnp.where(enough, mean, -jnp.inf))
 
 
 def draw(posterior: Posterior, temperature: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -40,5 +50,5 @@ def draw(posterior: Posterior, temperature: jax.Array, key: jax.Array) -> tuple[
 
 
 def exploration_probability(forced_exploration: jax.Array, episode: jax.Array) -> jax.Array:
-    """min(1, τ / k): with it episode k, from 1, takes random actions (equation 33)."""
+    """min(1, τ / k): with it the k-th episode after the warm-up, from 1, takes random actions (equation 33)."""
     return jnp.minimum(1.0, forced_exploration / episode)

@@ -45,6 +45,11 @@ def add(ring: jax.Array, rows: jax.Array, added: jax.Array) -> jax.Array:
     return jax.lax.dynamic_update_slice(ring, rows, start)
 
 
+def newest(ring: jax.Array, added: jax.Array) -> jax.Array:
+    """The row [F] that [C, F] received last; zeros where it is empty."""
+    return jax.lax.dynamic_index_in_dim(ring, (added - 1) % ring.shape[0], keepdims=False)
+
+
 def sample_indices(key: jax.Array, shape: tuple[int, ...], added: jax.Array, capacity: int) -> jax.Array:
     """Uniform indices of stored rows, with replacement. An empty ring gives zeros."""
     return jax.random.randint(key, shape, 0, jnp.clip(added, 1, capacity))

@@ -81,10 +81,14 @@ def _control_group_available() -> int:
 def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any) -> str:
     """What the run takes against what there is, in words.
 
+    Args:
+        shapes: of the train state.
+
     Raises:
         SettingError: it does not fit.
     """
     state, working = state_bytes(layout, shapes), working_bytes(settings, spec, layout)
+    working += state_bytes(layout, shapes.without_rings())  # as a stride began, should it have to be undone
     program = PROGRAM_BYTES if _on_cpu(layout) else 0
     free = available_bytes(layout)
     words = f"{state / GIB:.2f} GiB of buffers and networks, {working / GIB:.2f} GiB at work"

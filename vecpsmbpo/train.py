@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import algorithms, checkpoint, config, crash, envs, metrics, resources, runtime, versions
+from vecpsmbpo import algorithms, checkpoint, config, crash, envs, health, metrics, resources, runtime, versions
 from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
@@ -42,10 +42,6 @@ DISK_ERRORS = frozenset(
 
 class DiskError(Exception):
     """The run directory cannot be written; the last checkpoint is whole."""
-
-
-class Diverged(Exception):
-    """A loss or a parameter is not finite: what, of which seed and member, and when."""
 
 
 def make_driver(settings: Settings) -> Driver:
@@ -81,12 +77,11 @@ def train(settings: Settings) -> int:
     """Runs, or goes on with, the run in `settings.run_dir`.
 
     Returns:
-        0, or 128 + the number of the signal that stopped it.
+        0, 1 where a lane is frozen (`health`), or 128 + the number of the signal that stopped it.
 
     Raises:
         SettingError: it cannot be run as asked (`resources.check_memory`, `envs.make`).
         DiskError: the run directory cannot be written.
-        Diverged: something became NaN or infinite.
     """
     runtime.configure(settings)
     driver = make_driver(settings)
@@ -115,6 +110,7 @@ class _Run:
         if saved:
             driver.load_env(saved.host["env"])
         self.env_steps = saved.step if saved else 0
+        self.frozen = np.asarray(health.frozen(self.state.seeds.health))
         self.log = metrics.RunLog(self.run_dir, self.env_steps, settings.lanes[0])
         self.display = Display(driver.algorithm, self.env_steps)
         self.memory = memory
@@ -129,14 +125,17 @@ class _Run:
                 self._introduce()
                 if self.env_steps >= settings.total_steps:
                     self.display.say(f"already complete at {self.env_steps} steps; raise total_steps to go on")
-                    return 0
+                    return self._status
+                if self.frozen.all():
+                    self.display.say("every lane is frozen: there is nothing to go on with")
+                    return self._status
                 self.log.session({"env_steps": self.env_steps, **versions.current(), "devices": self._devices()})
                 # At once, and not after hours.
                 resources.check_disk(self.run_dir, self.state, settings.total_steps)
                 if self.saved_step is None:
                     self._save()
                 self._compile()
-                while self.env_steps < settings.total_steps and not stop.requested:
+                while self.env_steps < settings.total_steps and not stop.requested and not self.frozen.all():
                     self._chunk()
                 self._save()
                 return self._farewell(stop)
@@ -162,6 +161,8 @@ class _Run:
         self.display.say(f"memory: {self.memory}")
         where = f"resuming at step {self.env_steps}" if self.env_steps else "starting"
         self.display.say(f"run directory: {self.run_dir} ({where})")
+        for lane in np.flatnonzero(self.frozen):
+            self.display.say(self._frozen_words(lane))
 
     def _compile(self) -> None:
         cached = "; the compilation cache makes this short next time" if self.settings.compile_cache else ""
@@ -185,11 +186,11 @@ class _Run:
         steps = strides * settings.stride
         before, self.env_steps = self.env_steps, self.env_steps + steps
         self.epoch_steps_done += steps
-        self._check_finite(before)
         episodes = metrics.episode_lines(news, before, settings)
         self.log.episodes(episodes)
         self.display.chunk(self.env_steps, steps, seconds, [line["return"] for line in episodes])
-        if self.env_steps % settings.epoch_steps == 0:
+        self._note_frozen()
+        if self.env_steps % settings.epoch_steps == 0 and not self.frozen.all():
             self._end_epoch()
 
     def _strides(self, left: int) -> int:
@@ -208,8 +209,10 @@ class _Run:
         seconds = time.perf_counter() - self.epoch_began
         keys = evaluation_keys(settings, self.env_steps)
         returns = self.driver.evaluate(self.state, keys, settings.eval_episodes)
-        self.log.metrics(self._lines(returns, seconds))
-        self.display.epoch(self.env_steps, float(np.mean(returns.episode_return)))
+        lines = [line for line, frozen in zip(self._lines(returns, seconds), self.frozen, strict=True) if not frozen]
+        self.log.metrics(lines)
+        self.display.epoch(self.env_steps, float(np.mean([line["eval_return"] for line in lines])))
+        self._name_unsound(lines)
         epoch = self.env_steps // settings.epoch_steps
         if epoch % settings.checkpoint_every == 0 and self.env_steps < settings.total_steps:
             self._save()
@@ -231,6 +234,52 @@ class _Run:
             for index, line in enumerate(metrics.epoch_lines(self.state, settings))
         ]
 
+    def _note_frozen(self) -> None:
+        """Says and writes which lanes were frozen in the chunk that ended."""
+        before, self.frozen = self.frozen, np.asarray(health.frozen(self.state.seeds.health))
+        new = np.flatnonzero(self.frozen & ~before)
+        if new.size:
+            lines = metrics.epoch_lines(self.state, self.settings)
+            self.log.metrics(sorted((self._last_line(lines[lane], lane) for lane in new), key=lambda x: x["env_steps"]))
+        for lane in new:
+            self.display.say(self._frozen_words(lane))
+
+    def _last_line(self, line: metrics.Line, lane: int) -> metrics.Line:
+        """A lane's last, from `line` of its last good state. Its step is one that every checkpoint which knows of the
+        freezing has reached, and no other: it is never written twice."""
+        unknown = ("eval_return", "eval_length", "env_steps_per_s", "updates_per_s", "imagined_per_s")
+        return {
+            **line,
+            **dict.fromkeys(unknown),
+            "env_steps": int(self.state.seeds.health.env_steps[lane]),
+            "compile_seconds": self.driver.compile_seconds,
+            "seconds": self.watch(),
+            "frozen": True,
+            "not_finite": health.describe(self.state.seeds, lane, self.settings),
+        }
+
+    def _frozen_words(self, lane: int) -> str:
+        name = ", ".join(f"{name} {value:g}" for name, value in self.settings.lanes[lane].items())
+        step = int(self.state.seeds.health.env_steps[lane])
+        what = health.describe(self.state.seeds, lane, self.settings)
+        good = step - self.settings.stride
+        return f"{name} is frozen as it was at step {good}: {what} stopped being finite by step {step}"
+
+    def _name_unsound(self, lines: list[metrics.Line]) -> None:
+        """Names a task whose simulator returned NaN or infinity in the epoch that `lines` are of: also where it was
+        once, since that is a fault, and not so often as to hide anything else."""
+        steps = sum(line["unsound_steps"] for line in lines)
+        if steps:
+            self.display.say(
+                f"{self.settings.task} returned NaN or infinity at {steps} of {len(lines) * self.settings.epoch_steps} "
+                "steps of this epoch; each of them ended its episode, and none is stored"
+            )
+
+    @property
+    def _status(self) -> int:
+        """Exit status of a run that need not be gone on with."""
+        return int(self.frozen.any())
+
     def _save(self) -> None:
         if self.saved_step != self.env_steps:
             resources.check_disk(self.run_dir, self.state, self.env_steps)
@@ -240,50 +289,14 @@ class _Run:
 
     def _farewell(self, stop: "_Stop") -> int:
         self.display.say(f"saved at step {self.env_steps} of {self.settings.total_steps}: {self.run_dir}")
+        if self.frozen.all():
+            self.display.say("stopped: every lane is frozen; what is saved is the last good state of each")
+            return self._status
         if self.env_steps < self.settings.total_steps:
             self.display.say(f"to continue: vecpsmbpo train {shlex.quote(f'run_dir={self.run_dir}')}")
             return 128 + (stop.requested or 0)
         self.display.say(f"to evaluate: vecpsmbpo eval {shlex.quote(f'run_dir={self.run_dir}')} episodes=10")
-        return 0
-
-    def _check_finite(self, before: int) -> None:
-        seeds, settings = self.state.seeds, self.settings
-        for kind, tree, count in (
-            ("agents", seeds.agents, settings.n_members),
-            ("models", seeds.models, settings.n_models),
-        ):
-            if bool(_all_finite(tree)):
-                continue
-            tree = jax.tree.map(lambda x, count=count: x[:, :count], tree)
-            if bool(_all_finite(tree)):  # only those that fill the mesh
-                continue
-            what, seed, index = _first_not_finite(tree, kind)
-            member = (
-                f"model n = {index}"
-                if kind == "models"
-                else f"policy n = {index // settings.n_policies}, m = {index % settings.n_policies}"
-            )
-            lane = ", ".join(f"{name} {value:g}" for name, value in settings.lanes[seed].items())
-            last = "none" if self.saved_step is None else f"step {self.saved_step}"
-            raise Diverged(
-                f"{what} of {lane}, {member}, stopped being finite between steps {before} "
-                f"and {self.env_steps}; last good checkpoint: {last} in {self.run_dir}"
-            )
-
-
-@jax.jit
-def _all_finite(tree: Any) -> jax.Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
-
-
-def _first_not_finite(tree: Any, kind: str) -> tuple[str, int, int]:
-    """Name of the leaf, seed and member (or model) of the first entry that is not finite."""
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        bad = ~np.isfinite(np.asarray(leaf)).reshape(*leaf.shape[:2], -1).all(axis=-1)
-        if bad.any():
-            seed, index = np.argwhere(bad)[0]
-            return jax.tree_util.keystr(path).lstrip("."), int(seed), int(index)
-    raise AssertionError(f"{kind} are finite after all")
+        return self._status
 
 
 @dataclasses.dataclass

@@ -156,10 +156,12 @@ class Posterior(struct.PyTreeNode):
     Attributes:
         returns: [N·M], sum of the returns of each member's finished, non-random episodes (equation 19).
         compensation: [N·M], low-order part of `returns` that float32 addition lost (Kahan).
+        episodes: [N·M] int, how many those were.
     """
 
     returns: jax.Array
     compensation: jax.Array
+    episodes: jax.Array
 
 
 class Bandit(struct.PyTreeNode):
@@ -183,6 +185,7 @@ class Episode(struct.PyTreeNode):
 
     Attributes:
         index: [] int, k from 1.
+        warmups: [] int, how many of the episodes so far began within the warm-up.
         member: [] int, n·M + m of the acting policy; -1 where all of them act (`posterior=average`).
         random: [] bool, actions are uniform and the return is not credited.
         probs: [N·M], the distribution that `member` was drawn from.
@@ -190,6 +193,7 @@ class Episode(struct.PyTreeNode):
     """
 
     index: jax.Array
+    warmups: jax.Array
     member: jax.Array
     random: jax.Array
     probs: jax.Array
@@ -233,6 +237,20 @@ class Moments(struct.PyTreeNode):
     inputs: int = struct.field(pytree_node=False)
 
 
+class Health(struct.PyTreeNode):
+    """Where and when something of a lane stopped being finite; the codes are `health`'s. Every leaf [] int32.
+
+    Attributes:
+        place: of what first was not finite, from when on the lane is frozen.
+        env_steps: at the end of the stride in which that was.
+        seen: place of something not finite that passed by in the running stride and is not part of the state.
+    """
+
+    place: jax.Array
+    env_steps: jax.Array
+    seen: jax.Array
+
+
 class SeedState(struct.PyTreeNode):
     """Everything one seed owns. In a train state every leaf has a leading [S]; models, agents and imagined data
     have their member axis next and are spread over the mesh along it.
@@ -249,6 +267,8 @@ class SeedState(struct.PyTreeNode):
         memory: what acting remembers within an episode.
         bandit: which chooses λ; None where nothing is chosen.
         epoch_return, epoch_episodes: [], sum and number of the returns of the episodes that ended this epoch.
+        epoch_unsound: [], steps of this epoch at which the simulator returned something that is not finite.
+        health: whether the lane is frozen.
     """
 
     key: jax.Array
@@ -264,6 +284,8 @@ class SeedState(struct.PyTreeNode):
     bandit: Bandit | None
     epoch_return: jax.Array
     epoch_episodes: jax.Array
+    epoch_unsound: jax.Array
+    health: Health
 
 
 class Counters(NamedTuple):
@@ -289,3 +311,7 @@ class TrainState(struct.PyTreeNode):
     counters: Counters
     seeds: SeedState
     env: Any
+
+    def without_rings(self) -> "TrainState":
+        """All but D_E and D_M^{n,m}, which are nearly all of its bytes."""
+        return self.replace(seeds=self.seeds.replace(real=None, imagined=None))

@@ -41,6 +41,7 @@ class HostStep(NamedTuple):
         terminated: [B] bool.
         truncated: [B] bool, the episode ended for another reason, as a rule its time limit.
         next_obs: [B, O] the true successors, also where an episode ended.
+        sound: [B] bool, the step's numbers are finite; where they are not, the episode was truncated.
     """
 
     obs: np.ndarray
@@ -48,6 +49,7 @@ class HostStep(NamedTuple):
     terminated: np.ndarray
     truncated: np.ndarray
     next_obs: np.ndarray
+    sound: np.ndarray
 
 
 class HostEnv:
@@ -77,7 +79,9 @@ class HostEnv:
         return self._obs
 
     def step(self, actions: np.ndarray) -> HostStep:
-        """actions [B, A] in [-1, 1]; values outside are clipped.
+        """actions [B, A] in [-1, 1]; values outside are clipped, and NaN is 0.
+
+        A simulator that returns NaN or infinity (in float32) is reset.
 
         Raises:
             ValueError: `actions` has another shape.
@@ -85,17 +89,21 @@ class HostEnv:
         if np.shape(actions) != (self.num_envs, self.spec.action_size):
             expected = (self.num_envs, self.spec.action_size)
             raise ValueError(f"actions must have shape {expected}, not {np.shape(actions)}")
-        actions = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+        # NaN: of a policy that has diverged, until its lane is frozen. Some simulators fail at it.
+        actions = np.clip(np.nan_to_num(np.asarray(actions, np.float64)), -1.0, 1.0)
         results = [simulator.step(action) for simulator, action in zip(self.simulators, actions, strict=True)]
         next_obs, reward, terminated, cut = (np.asarray(column) for column in zip(*results, strict=True))
-        next_obs = next_obs.astype(np.float32)
+        with np.errstate(over="ignore"):  # to infinity, which is looked for
+            next_obs, reward = next_obs.astype(np.float32), reward.astype(np.float32)
+        sound = np.isfinite(np.column_stack([self._obs, next_obs, reward])).all(axis=1)
+        terminated = terminated & sound
         self._lengths += 1
-        truncated = (cut | (self._lengths >= self.episode_length)) & ~terminated
+        truncated = (cut | (self._lengths >= self.episode_length) | ~sound) & ~terminated
         self._obs = next_obs.copy()
         for index in np.flatnonzero(terminated | truncated):
             self._obs[index] = self.simulators[index].reset()
             self._lengths[index] = 0
-        return HostStep(self._obs, reward.astype(np.float32), terminated, truncated, next_obs)
+        return HostStep(self._obs, reward, terminated, truncated, next_obs, sound)
 
     def save(self) -> dict[str, Any]:
         """The state of every simulator, in JSON's types."""

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from dm_control import suite
+from dm_control.rl.control import PhysicsError
 
 from vecpsmbpo.envs import specs, termination
 from vecpsmbpo.envs.host import attributes
@@ -39,12 +40,16 @@ class DmControlSimulator(Simulator):
 
     def reset(self) -> np.ndarray:
         obs = _flat(self.env.reset().observation)
+        self._obs_size = obs.size
         self._state.begin_episode()
         return obs
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         self._state.begin_step(action)
-        timestep = self.env.step(self._low + (action + 1) * (self._high - self._low) / 2)
+        try:
+            timestep = self.env.step(self._low + (action + 1) * (self._high - self._low) / 2)
+        except PhysicsError:  # it has diverged
+            return np.full(self._obs_size, np.nan), np.nan, False, False
         terminated = bool(timestep.last() and timestep.discount == 0.0)
         return _flat(timestep.observation), float(timestep.reward), terminated, timestep.last() and not terminated
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import dynamics, imagination, mixture, posterior, replay
+from vecpsmbpo import dynamics, health, imagination, mixture, posterior, replay
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, EnvSpec, Episode, EpisodeEnd, Hyper, Moments, SeedState, Transition
@@ -88,11 +88,13 @@ class Algorithm(ABC):
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
             moments=_no_moments(size, spec.obs_size),
             posterior=members,
-            episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.bool_(True), draw_key),
+            episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.int32(1), jnp.bool_(True), draw_key),
             memory=self.memory(),
             bandit=mixture.init(settings) if settings.adapts_real_ratio else None,
             epoch_return=jnp.zeros(()),
             epoch_episodes=jnp.zeros(()),
+            epoch_unsound=jnp.zeros(()),
+            health=health.init(),
         )
 
     # ── act ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -103,6 +105,7 @@ class Algorithm(ABC):
         Shapes: obs [O] -> action [A].
         """
         policy_key, uniform_key = jax.random.split(key)
+        obs = jnp.where(jnp.isfinite(obs), obs, 0.0)  # a simulator's mistake must not become the policy's
         action, memory = self.choose(counters, state, obs, policy_key)
         uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0, maxval=1.0)
         return jnp.where(state.episode.random, uniform, action), memory
@@ -117,12 +120,16 @@ class Algorithm(ABC):
         truncated: jax.Array,
         key: jax.Array,
     ) -> tuple[SeedState, EpisodeEnd]:
-        """Stores a real transition; where it ends the episode, credits the member and draws the next one."""
+        """Stores a real transition; where it ends the episode, credits the member and draws the next one.
+
+        Where something in it is not finite, the episode ends before it, truncated, with the return so far.
+        """
         episode, bandit = state.episode, state.bandit
-        total = episode.episode_return + transition.reward
+        row, sound = self._row(counters, state, transition)
+        total = episode.episode_return + jnp.where(sound, transition.reward, 0.0)
         length = episode.length + 1
-        terminated = transition.terminated > 0
-        done = terminated | truncated
+        terminated = (transition.terminated > 0) & sound
+        done = terminated | truncated | ~sound
         end = EpisodeEnd(
             done=done,
             index=episode.index,
@@ -140,28 +147,45 @@ class Algorithm(ABC):
             credited = mixture.credit(bandit, arm, total)
             bandit = jax.tree.map(partial(jnp.where, counts), credited, bandit)
         random = counters.env_steps + 1 < self.settings.warmup_steps
-        following = self._begin_episode(members, state.hyper, episode.index + 1, random, key)
+        index, warmups = episode.index + 1, episode.warmups + random
+        following = self._begin_episode(members, state.hyper, index, warmups, random, key)
         running = episode.replace(episode_return=total, length=length)
         state = state.replace(
-            real=replay.add(state.real, replay.pack(transition)[None], counters.env_steps),
-            moments=_welford(state.moments, transition, counters.env_steps),
+            real=replay.add(state.real, row[None], counters.env_steps),
+            moments=_welford(state.moments, self._unpack(row), counters.env_steps),
             posterior=members,
             episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
             memory=jax.tree.map(partial(jnp.where, done), self.memory(), state.memory),
             bandit=bandit,
             epoch_return=state.epoch_return + jnp.where(done, total, 0.0),
             epoch_episodes=state.epoch_episodes + done,
+            epoch_unsound=state.epoch_unsound + ~sound,
+            health=health.note(state.health, health.ACTION, ~jnp.all(jnp.isfinite(transition.action))),
         )
         return state, end
 
-    def _begin_episode(self, members, hyper: Hyper, index, random, key: jax.Array) -> Episode:
+    def _row(self, counters: Counters, state: SeedState, transition: Transition) -> tuple[jax.Array, jax.Array]:
+        """The row [F] to store for a transition, and whether it is the transition: [] bool.
+
+        One that is not finite is never stored. Since every seed adds a row per step, the last good one is stored again;
+        at a run's very first step there is none, and it is a row of zeros.
+        """
+        row = replay.pack(transition)
+        sound = jnp.all(jnp.isfinite(row))
+        return jnp.where(sound, row, replay.newest(state.real, counters.env_steps)), sound
+
+    def _unpack(self, rows: jax.Array) -> Transition:
+        return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
+
+    def _begin_episode(self, members, hyper: Hyper, index, warmups, random, key: jax.Array) -> Episode:
         member, probs = posterior.draw(members, hyper.temperature, key)
         if self.settings.posterior == "average":
             member = jnp.int32(-1)
-        explores = posterior.exploration_probability(hyper.forced_exploration, index)
+        after_warmup = jnp.maximum(index - warmups, 1)
+        explores = posterior.exploration_probability(hyper.forced_exploration, after_warmup)
         random |= jax.random.bernoulli(jax.random.fold_in(key, 1), explores)
         zero = jnp.zeros(())
-        return Episode(index, member, random, probs, episode_return=zero, length=jnp.int32(0))
+        return Episode(index, warmups, member, random, probs, episode_return=zero, length=jnp.int32(0))
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
@@ -188,6 +212,7 @@ class Algorithm(ABC):
             agents=state.agents.replace(stats=cleared(state.agents.stats)),
             epoch_return=cleared(state.epoch_return),
             epoch_episodes=cleared(state.epoch_episodes),
+            epoch_unsound=cleared(state.epoch_unsound),
         )
 
     def fit_models(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:

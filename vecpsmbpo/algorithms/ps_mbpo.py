@@ -4,13 +4,14 @@ MBPO and SAC are settings of it: one policy that learns in all models (`rollout_
 real data alone (λ = 1, equation 15). They share every line, so that comparisons differ in the posterior only.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import imagination, posterior, replay, sac
+from vecpsmbpo import health, imagination, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.networks import Actor
 from vecpsmbpo.types import Agent, Counters, Params, SeedState, Transition
@@ -33,7 +34,7 @@ class PsMbpo(Algorithm):
 
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> Params:
         """Parameters for `evaluation_action`, by `eval_policy`: of the member that the posterior would pick now, of the
-        member that has earned the most, or of all members."""
+        member that has earned the most per episode, or of all members."""
         if self._evaluates_all:
             return state.agents.actor
         if self.settings.eval_policy == "best":
@@ -81,8 +82,8 @@ class PsMbpo(Algorithm):
 
     @property
     def _evaluates_all(self) -> bool:
-        chosen = self.settings.eval_policy
-        return chosen == "average" or (chosen == "posterior" and self.settings.posterior == "average")
+        # Nobody earns anything where all act together: there is no best member either, and all are it.
+        return "average" in (self.settings.eval_policy, self.settings.posterior)
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
@@ -96,7 +97,8 @@ class PsMbpo(Algorithm):
         """Rolls every member (n, m) out in model n from real states (lines 9 and 10), into its own ring.
 
         Adds `imagined_rows` rows to every ring: a row whose rollout terminates goes on from a fresh real state, so
-        that shapes stay fixed and every stored row is valid.
+        that shapes stay fixed and every stored row is valid. Rows that are not finite, of a model or policy beyond
+        help, are stored as zeros, and the lane is frozen before anything is kept that was learned from them.
         """
         settings, spec, layout = self.settings, self.spec, self.layout
         chunk = imagination.chunk_size(settings)
@@ -108,30 +110,35 @@ class PsMbpo(Algorithm):
 
         def real_states(keys):
             """[P_local] -> [P_local, chunk, O]; for all members at once, as `learn` draws minibatches."""
-            return jax.vmap(lambda key: imagination.start_states(state.real, counters.env_steps, key, chunk, spec))(
-                keys
-            )
+            draw = partial(imagination.start_states, state.real, counters.env_steps, count=chunk, spec=spec)
+            return jax.vmap(draw)(keys)
 
         def advance(model, actor, obs, fresh, key):
             transition = imagination.step(model, actor, obs, key, settings=settings, spec=spec)
             return replay.pack(transition), jnp.where(transition.terminated[:, None], fresh, transition.next_obs)
 
         def step(t, carry):
-            imagined, obs, rows, key = carry
+            imagined, sound, obs, rows, key = carry
             keys = jax.vmap(jax.random.split)(layout.keys(jax.random.fold_in(key, t), ids))
             fresh = real_states(keys[:, 1])
             rows_now, obs = layout.map_local(advance, models, state.agents.actor, obs, fresh, keys[:, 0])
-            return replay.add(imagined, rows_now, rows), obs, rows + chunk, key
+            finite = jnp.all(jnp.isfinite(rows_now), axis=-1)
+            imagined = replay.add(imagined, jnp.where(finite[..., None], rows_now, 0.0), rows)
+            return imagined, sound & jnp.all(finite, axis=-1), obs, rows + chunk, key
 
         def rollout(c, carry):
-            imagined, rows = carry
+            imagined, sound, rows = carry
             start_key, step_key = jax.random.split(jax.random.fold_in(key, c))
             obs = real_states(layout.keys(start_key, ids))
-            imagined, _, rows, _ = jax.lax.fori_loop(0, horizon, step, (imagined, obs, rows, step_key))
-            return imagined, rows
+            imagined, sound, _, rows, _ = jax.lax.fori_loop(0, horizon, step, (imagined, sound, obs, rows, step_key))
+            return imagined, sound, rows
 
-        imagined, _ = jax.lax.fori_loop(0, chunks, rollout, (state.imagined, counters.imagined_rows))
-        return state.replace(imagined=imagined)
+        start = (state.imagined, jnp.ones(ids.shape, bool), counters.imagined_rows)
+        imagined, sound, _ = jax.lax.fori_loop(0, chunks, rollout, start)
+        sound |= ids >= layout.n_members
+        first = layout.least_of_members(jnp.min(jnp.where(sound, layout.n_members, ids)))
+        noted = health.note(state.health, health.IMAGINED, first < layout.n_members, first)
+        return state.replace(imagined=imagined, health=noted)
 
     def imagined_rows(self, counters: Counters, enabled: jax.Array) -> jax.Array:
         """The counter of `counters` after `imagine`."""
@@ -183,4 +190,4 @@ class PsMbpo(Algorithm):
         )
         from_real = jax.random.uniform(source_key, shape) < real_ratio
         rows = jnp.where(from_real[..., None], state.real[real_index], imagined[imagined_index])
-        return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
+        return self._unpack(rows)

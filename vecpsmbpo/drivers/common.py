@@ -2,7 +2,8 @@
 
 A period is `model_update_every` steps: it begins with a refresh (models refitted, imagination renewed); then every step
 acts, observes and learns. A chunk is a number of strides, a few steps each, decided when the program is called: one
-compiled program serves chunks of any length, and how a run is cut into chunks does not change it.
+compiled program serves chunks of any length, and how a run is cut into chunks does not change it. A stride is also what
+is undone in a lane where something stops being finite (`health`): its news are none.
 """
 
 import time
@@ -30,6 +31,18 @@ class Returns(NamedTuple):
     length: np.ndarray
 
 
+class EpisodeKeys(NamedTuple):
+    """Of evaluation episodes. Resets and actions need keys of their own: what a reset splits its key into are the very
+    keys that `fold_in` makes of it for the first steps.
+
+    Shapes: policy [S], resets and actions [S, E].
+    """
+
+    policy: jax.Array
+    resets: jax.Array
+    actions: jax.Array
+
+
 class Driver(Protocol):
     """What `train` and `evaluate` need of a driver."""
 
@@ -47,7 +60,8 @@ class Driver(Protocol):
         """Builds the programs, so that the first chunk does not have to."""
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
-        """A chunk, of an epoch at most. The state given is consumed. News have leaves [strides * stride, S, ...]."""
+        """A chunk, of an epoch at most. The state given is consumed. News have leaves [strides * stride, S, ...]; there
+        are none of frozen lanes."""
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
         """Whole episodes of the evaluation policy, in environments of their own. keys [S]."""
@@ -143,7 +157,7 @@ def evaluation_actions(
     """Actions [E, A] of the evaluation policy of one seed in E episodes, at the same step of each, and their memory.
 
     Args:
-        memory, obs, keys: leaves [E, ...]; an episode's key serves all its steps.
+        memory, obs, keys: leaves [E, ...]; an episode's key, of `EpisodeKeys.actions`, serves all its steps.
     """
     keys = jax.vmap(lambda key: jax.random.fold_in(key, step))(keys)
     return jax.vmap(partial(algorithm.evaluation_action, policy, step))(memory, obs, keys)
@@ -154,6 +168,7 @@ def many(tree: Any, *counts: int) -> Any:
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (*counts, *x.shape)), tree)
 
 
-def split_for_episodes(keys: jax.Array, episodes: int) -> jax.Array:
-    """Keys [S] -> [S, 1 + E]: one for the policy, one for each episode."""
-    return jax.vmap(lambda key: jax.random.split(key, 1 + episodes))(keys)
+def split_for_episodes(keys: jax.Array, episodes: int) -> EpisodeKeys:
+    """Keys [S] -> one for the policy, two for each of E episodes."""
+    split = jax.vmap(lambda key: jax.random.split(key, 1 + 2 * episodes))(keys)
+    return EpisodeKeys(split[:, 0], split[:, 1 : 1 + episodes], split[:, 1 + episodes :])

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vecpsmbpo import health
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers.common import (
     BY_SEED,
@@ -46,9 +47,9 @@ class HostDriver:
         self._env = env
         self._env.episode_length = self.settings.episode_length
         specs, seeds = self.layout.specs(), self.layout.specs().seeds
-        spread = self.layout.spread
+        spread, before = self.layout.spread, specs.without_rings()
         self._init = spread(self._init_local, (BY_SEED, BY_SEED, BY_SEED), specs)
-        self._begin = spread(lambda state: begin_stride(algorithm, state), (specs,), (specs, SHARED), donate_argnums=0)
+        self._begin = spread(self._begin_local, (specs,), (before, specs, SHARED), donate_argnums=0)
         self._act = spread(self._act_local, (specs.counters, seeds, BY_SEED), (BY_SEED, BY_SEED, BY_SEED))
         self._observe = spread(
             self._observe_local,
@@ -56,6 +57,7 @@ class HostDriver:
             (specs, BY_SEED),
             donate_argnums=0,
         )
+        self._settle = spread(partial(health.settle, self.layout), (before, specs), (specs, BY_SEED), donate_argnums=1)
         self._policies = evaluation_policies(algorithm)
         self._evaluation_actions = spread(
             jax.vmap(partial(evaluation_actions, algorithm), in_axes=(0, None, 0, 0, 0)),
@@ -74,9 +76,9 @@ class HostDriver:
         spec, seeds, episodes = self.algorithm.spec, self.layout.num_seeds, self.settings.eval_episodes
         obs, number = self._shape(spec.obs_size), self._shape()
         action, memory, keys = jax.eval_shape(self._act, state.counters, state.seeds, obs)
-        _, learning = jax.eval_shape(self._begin, state)
+        before, _, learning = jax.eval_shape(self._begin, state)
         transition, flag = Transition(obs, action, number, obs, number), jax.ShapeDtypeStruct((seeds,), bool)
-        episode_keys = jax.eval_shape(lambda key: split_for_episodes(key, episodes)[:, 1:], state.seeds.key)
+        episode_keys = jax.eval_shape(lambda key: split_for_episodes(key, episodes).actions, state.seeds.key)
         policies = jax.eval_shape(self._policies, state.seeds, state.seeds.key)
         remembered = jax.eval_shape(lambda: many(self.algorithm.memory(), seeds, episodes))
         states = self._shape(episodes, spec.obs_size)
@@ -84,19 +86,24 @@ class HostDriver:
             (self._begin, (state,)),
             (self._act, (state.counters, state.seeds, obs)),
             (self._observe, (state, memory, transition, flag, keys, obs, learning)),
+            (self._settle, (before, state)),
             (self._policies, (state.seeds, state.seeds.key)),
             (self._evaluation_actions, (policies, jnp.int32(0), remembered, states, episode_keys)),
         ]
         executables, self.compile_seconds = compiled(programs)
-        self._begin, self._act, self._observe, self._policies, self._compiled_evaluation_actions = executables
+        self._begin, self._act, self._observe, self._settle, self._policies, actions = executables
+        self._compiled_evaluation_actions = actions
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
         news = []
         for _ in range(strides):
-            state, learning = self._begin(state)
+            before, state, learning = self._begin(state)
+            ends = []
             for _ in range(self.settings.stride):
                 state, end = self._step(state, learning)
-                news.append(end)
+                ends.append(end)
+            state, frozen = self._settle(before, state)
+            news += [end.replace(done=end.done & ~np.asarray(frozen)) for end in ends]
         return state, jax.tree.map(lambda *xs: np.stack(xs), *news)
 
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
@@ -111,8 +118,8 @@ class HostDriver:
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
         seeds, obs_size = self.layout.num_seeds, self.algorithm.spec.obs_size
         split = split_for_episodes(keys, episodes)
-        policies = self._policies(state.seeds, split[:, 0])
-        env_seed = int(jax.random.randint(split[0, 1], (), 0, 2**30))
+        policies = self._policies(state.seeds, split.policy)
+        env_seed = int(jax.random.randint(split.resets[0, 0], (), 0, 2**30))
         env = self._make_env(num_envs=seeds * episodes, seed=env_seed)
         env.episode_length = self.settings.episode_length
         obs = env.reset()
@@ -124,10 +131,10 @@ class HostDriver:
             if not alive.any():
                 break
             states = obs.reshape(seeds, episodes, obs_size)
-            action, memory = act(policies, jnp.int32(t), memory, states, split[:, 1:])
+            action, memory = act(policies, jnp.int32(t), memory, states, split.actions)
             step = env.step(np.asarray(action).reshape(count, -1))
             obs = step.obs
-            total += np.where(alive, step.reward, 0.0)
+            total += np.where(alive & step.sound, step.reward, 0.0)
             length += alive
             alive &= ~(step.terminated | step.truncated)
         return Returns(total.reshape(seeds, episodes), length.reshape(seeds, episodes))
@@ -145,6 +152,9 @@ class HostDriver:
     def _init_local(self, keys: jax.Array, hyper: Hyper, obs: jax.Array) -> TrainState:
         counters = Counters(env_steps=jnp.int32(0), imagined_rows=jnp.int32(0))
         return TrainState(counters, jax.vmap(self.algorithm.init)(keys, hyper), obs)
+
+    def _begin_local(self, state: TrainState) -> tuple[TrainState, TrainState, jax.Array]:
+        return state.without_rings(), *begin_stride(self.algorithm, state)
 
     def _act_local(self, counters: Counters, seeds: SeedState, obs: jax.Array) -> tuple[jax.Array, Any, jax.Array]:
         # The key is not advanced here but in `_observe_local`, which splits the same one: acting needs no copy of

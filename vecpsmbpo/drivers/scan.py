@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
+from vecpsmbpo import health
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers.common import (
     BY_SEED,
     SHARED,
+    EpisodeKeys,
     Returns,
     begin_stride,
     compiled,
@@ -83,9 +85,12 @@ class ScanDriver:
 
         def stride(index, carry):
             state, log = carry
+            before = state.without_rings()
             state, learning = begin_stride(self.algorithm, state)
             step = lambda state, _: self._step(state, learning)  # noqa: E731
             state, news = jax.lax.scan(step, state, None, length=settings.stride)
+            state, frozen = health.settle(self.layout, before, state)
+            news = news.replace(done=news.done & ~frozen)
             return state, jax.tree.map(lambda all_, new: all_.at[index].set(new), log, news)
 
         shape = (settings.epoch_steps // settings.stride, settings.stride, state.env.obs.shape[0])
@@ -113,23 +118,24 @@ class ScanDriver:
         env = jax.lax.cond(jnp.any(end.done), begin_episodes, lambda env: env, env)
         return TrainState(counters, seeds, env), end
 
-    def _evaluate_local(self, seeds: SeedState, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _evaluate_local(self, seeds: SeedState, keys: EpisodeKeys) -> tuple[jax.Array, jax.Array]:
         def one_seed(seed, keys):
-            policy = self.algorithm.evaluation_policy(seed, keys[0])
+            policy = self.algorithm.evaluation_policy(seed, keys.policy)
 
             def step(carry):
                 t, memory, env, total, length, alive = carry
-                action, memory = evaluation_actions(self.algorithm, policy, t, memory, env.obs, keys[1:])
-                env = jax.vmap(self.env.step)(env, action)
-                total = total + jnp.where(alive, env.reward, 0.0)
-                return t + 1, memory, env, total, length + alive, alive & (env.done == 0)
+                action, memory = evaluation_actions(self.algorithm, policy, t, memory, env.obs, keys.actions)
+                after = jax.vmap(self.env.step)(env, action)
+                sound = health.sound(env.obs, after.reward, after.obs)
+                total = total + jnp.where(alive & sound, after.reward, 0.0)
+                return t + 1, memory, after, total, length + alive, alive & sound & (after.done == 0)
 
             def running(carry):
                 t, *_, alive = carry
                 return (t < self.settings.episode_length) & jnp.any(alive)
 
-            count = keys.shape[0] - 1
-            start = jax.vmap(self.env.reset)(keys[1:])
+            count = keys.resets.shape[0]
+            start = jax.vmap(self.env.reset)(keys.resets)
             memory = many(self.algorithm.memory(), count)
             carry = (0, memory, start, jnp.zeros(count), jnp.zeros(count, jnp.int32), jnp.ones(count, bool))
             *_, total, length, _ = jax.lax.while_loop(running, step, carry)
