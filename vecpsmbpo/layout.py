@@ -129,6 +129,10 @@ class Layout:
         """This device's models [N_local, ...] -> all of them, [N, ...]."""
         return jax.tree.map(lambda x: _everywhere(x)[: self.n_models], models)
 
+    def all_members(self, values: jax.Array) -> jax.Array:
+        """What this device's members have, [P_local, ...] -> what all have, [N·M, ...]."""
+        return _everywhere(values)[: self.n_members]
+
     def all_models_for_members(self, models: Any) -> Any:
         """This device's models [N_local, ...] -> all N of them for each of its members, [P_local, N, ...]."""
         members = self.member_ids().shape[0]

@@ -128,6 +128,8 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
                 "probs": news.probs[step, seed].reshape(-1, settings.n_policies).tolist(),
             }
         )
+        if news.values is not None:
+            lines[-1]["values"] = news.values[step, seed].reshape(-1, settings.n_policies).tolist()
     return lines
 
 

@@ -40,7 +40,8 @@ class PsMbpo(Algorithm):
         if self.settings.eval_policy == "best":
             member = posterior.best(state.posterior)
         else:
-            member, _ = posterior.draw(state.posterior, state.hyper.temperature, key)
+            logits = posterior.logits(state.posterior, self.values(state), state.hyper.temperature)
+            member, _ = posterior.draw(logits, key)
         return self.layout.ask(member, state.agents.actor)
 
     def evaluation_action(
@@ -56,6 +57,28 @@ class PsMbpo(Algorithm):
             return self._of_mixture(policy, obs, key, sampled=sampled), ()
         modes = jax.vmap(lambda params: self._actor.law(params, obs).mode())(policy)
         return self.layout.mean_over_members(modes), ()
+
+    def values(self, state: SeedState) -> jax.Array | None:
+        """[N·M] min(Q_1, Q_2) of each member's mean action, averaged over the starts of the last episodes.
+
+        The paper offers value functions in place of accumulated returns (section 3.3, after Agarwal and Zhang, 2022):
+        what a member expects to earn, in its own model's world, rather than what it has earned. Members are comparable
+        since all are asked about the same states, the real starts, and since none may promise more or less than the
+        rewards seen so far allow: a critic that runs away is not preferred for it.
+        """
+        if not self.settings.weighs_values:
+            return None
+        nets, moments = sac.make_networks(self.settings, self.spec), state.moments
+        known = jnp.arange(posterior.STARTS) < state.episode.index
+
+        def value(agent: Agent) -> jax.Array:
+            action = nets.actor.law(agent.actor, state.starts).mode()
+            q = jnp.minimum(*nets.critic.values(agent.critic, state.starts, action))
+            return jnp.sum(jnp.where(known, q, 0.0)) / jnp.sum(known)
+
+        limits = sac.Limits(moments.lowest_reward, moments.highest_reward)
+        least, most = sac.target_range(limits, jnp.float32(0.0), state.hyper, self.spec.action_size)
+        return jnp.clip(self.layout.all_members(jax.vmap(value)(state.agents)), least, most)
 
     def _of_member(
         self, member: jax.Array, actors: Params, obs: jax.Array, key: jax.Array, *, sampled: bool = True
