@@ -25,13 +25,13 @@ class Task:
         code: by backend, `module:attribute` below `vecpsmbpo.envs.<backend>`: a class of MJX ports or a function that
             makes one, and a function that makes a `HostEnv`. The backend that `auto` takes comes first.
         sizes: of this task; None for a whole suite, whose tasks are named by `env.*` options.
-        extra: of this package, where the suite is not among its core dependencies.
+        needs: what to give to `pip install`, where installing this package may leave the suite out.
     """
 
     suite: str
     code: dict[str, str] = field(hash=False)
     sizes: Sizes | None = None
-    extra: str | None = None
+    needs: str | None = None
 
     @property
     def backends(self) -> tuple[str, ...]:
@@ -42,12 +42,16 @@ class Task:
         return importlib.util.find_spec(self.suite) is not None
 
 
+# Without labmaze, which has no wheel for Python 3.13 (pyproject.toml).
+DM_CONTROL = "--no-deps dm-control==1.0.49"
+
+
 def _gymnasium(name: str, port: str, *sizes: int) -> Task:
     return Task("gymnasium", {"mjx": f"{name}:{port}", "host": f"gymnasium:{name}"}, Sizes(*sizes))
 
 
 def _dm_control(name: str, port: str, *sizes: int) -> Task:
-    return Task("dm_control", {"mjx": port, "host": f"dm_control:{name}"}, Sizes(*sizes))
+    return Task("dm_control", {"mjx": port, "host": f"dm_control:{name}"}, Sizes(*sizes), needs=DM_CONTROL)
 
 
 TASKS = {
@@ -61,9 +65,9 @@ TASKS = {
     "window_open": Task("metaworld", {"host": "metaworld:window_open"}, Sizes(39, 4, 250)),
     # any task of a suite, and anybody's own
     "gymnasium": Task("gymnasium", {"host": "gymnasium:any_task"}),
-    "dm_control": Task("dm_control", {"host": "dm_control:any_task"}),
+    "dm_control": Task("dm_control", {"host": "dm_control:any_task"}, needs=DM_CONTROL),
     "metaworld": Task("metaworld", {"host": "metaworld:any_task"}),
-    "playground": Task("mujoco_playground", {"mjx": "playground:any_task"}, extra="playground"),
+    "playground": Task("mujoco_playground", {"mjx": "playground:any_task"}, needs="'vecpsmbpo[playground]'"),
     "brax": Task("brax", {"mjx": "brax:any_task"}),
     "custom": Task("vecpsmbpo", {"mjx": "custom:own_task", "host": "custom:own_task"}),
 }
@@ -106,8 +110,7 @@ def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0, 
     backend = resolve_backend(name, backend)
     task = TASKS[name]
     if not task.installed:
-        package = f"'vecpsmbpo[{task.extra}]'" if task.extra else task.suite
-        raise SettingError(f"env={name}: needs the package {task.suite}; pip install {package}")
+        raise SettingError(f"env={name}: needs the package {task.suite}; pip install {task.needs or task.suite}")
     module, attribute = task.code[backend].split(":")
     found = getattr(importlib.import_module(f"vecpsmbpo.envs.{backend}.{module}"), attribute)
     return found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **options)

@@ -8,9 +8,13 @@ import subprocess
 import sys
 
 import hydra
+import jax
+import mujoco
 import pytest
 
+import vecpsmbpo
 from tests.helpers import command, environment
+from tests.test_setup import DM_CONTROL
 from vecpsmbpo import cli, config
 from vecpsmbpo.envs.registry import TASKS
 from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, allowed, check
@@ -101,12 +105,24 @@ def test_help_and_envs_answer_without_jax(arguments, tmp_path):
     assert "hopper" in result.stdout
 
 
-def test_envs_names_every_task_and_the_extra_that_is_missing(monkeypatch, capsys):
-    monkeypatch.setattr("vecpsmbpo.envs.registry.Task.installed", property(lambda task: task.extra == ""))
+def test_version_says_what_a_report_needs_without_jax(tmp_path):
+    program = [sys.executable, "-c", WITHOUT_JAX, "--version"]
+    result = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stderr) == (0, "")
+    python = ".".join(map(str, sys.version_info[:3]))
+    expected = f"vecpsmbpo {vecpsmbpo.__version__}, jax {jax.__version__}, mujoco {mujoco.__version__}, python {python}"
+    assert result.stdout == f"{expected}\n"
+
+
+def test_envs_names_every_task_and_how_to_install_what_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr("vecpsmbpo.envs.registry.Task.installed", property(lambda task: False))
     assert cli.main(["envs"]) == 0
     lines = capsys.readouterr().out.splitlines()[1:]
     assert [line.split()[0] for line in lines] == list(TASKS)
-    assert next(line for line in lines if "pip install 'vecpsmbpo[playground]'" in line).split()[0] == "playground"
+    said = {line.split()[0]: line.partition("no: pip install ")[2].rstrip() for line in lines}
+    assert said["playground"] == "'vecpsmbpo[playground]'"
+    assert said["dm_control"] == said["ball_in_cup"] == f"--no-deps {DM_CONTROL}"
+    assert said["hopper"] == "gymnasium"
 
 
 def test_too_little_memory_is_said_before_anything_is_allocated(tmp_path):

@@ -19,6 +19,7 @@ CAPACITY = 2048
 def linear():
     """Rows of Δs = (0.5 a, -0.2 s_0) with noise 0.1, r = s_1: and the settings to fit them."""
     settings = tiny(
+        recipe="paper",
         model_hidden_size=32,
         model_batch_size=64,
         model_max_epochs=200,
@@ -34,8 +35,9 @@ def linear():
 
 
 def _moments(rows):
-    values = jnp.concatenate([rows[:, :3], rows[:, 3:5] - rows[:, :2]], axis=1)
-    return Moments(values.mean(0), ((values - values.mean(0)) ** 2).sum(0), inputs=3)
+    values = jnp.concatenate([rows[:, :3], rows[:, 3:5] - rows[:, :2], rows[:, 5:6]], axis=1)
+    deviation = ((values - values.mean(0)) ** 2).sum(0)
+    return Moments(values.mean(0), deviation, jnp.min(rows[:, 5]), jnp.max(rows[:, 5]), inputs=3)
 
 
 @pytest.fixture(scope="module")

@@ -78,33 +78,36 @@ def test_predictions_are_drawn_with_the_network_s_variance(key):
 
 
 def test_whitening_uses_the_data_s_mean_and_standard_deviation():
-    rows = np.random.default_rng(0).normal(5.0, 3.0, size=(40, 3))
+    rows = np.random.default_rng(0).normal(5.0, 3.0, size=(40, 4))  # obs, action, Δs, r
     rows[:, 1] = 7.0  # never varies: left unscaled
-    moments = Moments(jnp.asarray(rows.mean(0)), jnp.asarray(((rows - rows.mean(0)) ** 2).sum(0)), inputs=2)
-    mean, std, changes = dynamics.scaling(moments, jnp.int32(40), tiny())
+    deviation = jnp.asarray(((rows - rows.mean(0)) ** 2).sum(0))
+    moments = Moments(jnp.asarray(rows.mean(0)), deviation, jnp.zeros(()), jnp.zeros(()), inputs=2)
+    mean, std, outputs = dynamics.scaling(moments, jnp.int32(40), tiny(recipe="paper"))
     np.testing.assert_allclose(mean, rows.mean(0)[:2], rtol=1e-5)
     np.testing.assert_allclose(std, [rows[:, 0].std(), 1.0], rtol=1e-5)
-    np.testing.assert_array_equal(changes, [1, 1])  # A.1: as they are
-    _, _, changes = dynamics.scaling(moments, jnp.int32(40), tiny(whiten_targets=True))
-    np.testing.assert_allclose(changes, [rows[:, 2].std(), 1.0], rtol=1e-5)
+    np.testing.assert_array_equal(outputs, [1, 1])  # A.1: as they are
+    _, _, outputs = dynamics.scaling(moments, jnp.int32(40), tiny(whiten_targets=True))
+    np.testing.assert_allclose(outputs, rows[:, 2:].std(0), rtol=1e-5)
 
 
 def test_optimistic_probabilities_by_hand():
     # Equation 19: returns 100, 300, 300, 0 at τ = 100: e^1, e^3, e^3, e^0 over their sum 43.8894.
     earned = Posterior(jnp.array([100.0, 300.0, 300.0, 0.0]), jnp.zeros(4), jnp.zeros(4, int))
     expected = np.exp([1, 3, 3, 0]) / np.exp([1, 3, 3, 0]).sum()
-    np.testing.assert_allclose(jax.nn.softmax(posterior.logits(earned, 100.0)), expected, rtol=1e-6)
+    np.testing.assert_allclose(jax.nn.softmax(posterior.logits(earned, None, 100.0)), expected, rtol=1e-6)
 
 
 def test_infinite_temperature_is_uniform():
     earned = Posterior(jnp.array([1e6, 0.0, -1e6]), jnp.zeros(3), jnp.zeros(3, int))
-    np.testing.assert_array_equal(jax.nn.softmax(posterior.logits(earned, jnp.inf)), np.full(3, 1 / 3, np.float32))
+    np.testing.assert_array_equal(
+        jax.nn.softmax(posterior.logits(earned, None, jnp.inf)), np.full(3, 1 / 3, np.float32)
+    )
 
 
 def test_members_are_drawn_with_the_probabilities_of_equation_19():
     earned = Posterior(jnp.array([10.0, 20.0, 0.0, 15.0]), jnp.zeros(4), jnp.zeros(4, int))
     keys = jax.random.split(jax.random.key(1), 20_000)
-    members, probs = jax.vmap(lambda key: posterior.draw(earned, jnp.float32(10.0), key))(keys)
+    members, probs = jax.vmap(lambda key: posterior.draw(posterior.logits(earned, None, jnp.float32(10.0)), key))(keys)
     counts = np.bincount(members, minlength=4)
     expected = np.asarray(probs[0], np.float64)
     assert scipy.stats.chisquare(counts, expected / expected.sum() * 20_000).pvalue > 1e-3
@@ -118,7 +121,7 @@ def test_accumulated_returns_stay_exact_over_thousands_of_episodes():
 
     earned, _ = jax.lax.scan(add, posterior.init(3), jnp.asarray(returns))
     exact = returns.astype(np.float64).sum()
-    logits = posterior.logits(earned, jnp.float32(15_000.0))
+    logits = posterior.logits(earned, None, jnp.float32(15_000.0))
     assert float(logits[1] - logits[0]) == pytest.approx(exact / 15_000, rel=1e-6)
     assert earned.returns[0] == 0
 

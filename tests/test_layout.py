@@ -1,13 +1,15 @@
 """Batching changes nothing: vmap, loops, one device or two give the same members."""
 
 import dataclasses
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.helpers import algorithm, initial, tiny
+from tests.helpers import algorithm, environment, initial, tiny
 from vecpsmbpo import sac
 from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs import specs
@@ -154,3 +156,41 @@ def test_the_mesh_gives_the_busiest_device_least_to_do(lanes, parts, most, shape
     assert lanes % found[0] == 0
     assert work(*found) == work(*shape)
     assert found[0] * found[1] <= shape[0] * shape[1] <= most
+
+
+EMPTY = """
+import sys
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, PartitionSpec as P
+from vecpsmbpo.layout import Layout
+
+jax.config.update("jax_num_cpu_devices", 2)
+layout = Layout(Mesh(np.array(jax.devices()).reshape(2, 1), ("seeds", "members")), 2, 1, 1, 1, True)
+ours = lambda body, specs: layout.spread(body, specs, P("seeds"))
+jaxs = lambda body, specs: jax.jit(jax.shard_map(body, mesh=layout.mesh, in_specs=specs, out_specs=P("seeds")))
+x, nothing = jnp.arange(4.0), jnp.zeros((4, 0))
+cases = {
+    "given": (lambda x, y: x + y.sum(), (P("seeds"), P("seeds")), (x, nothing)),
+    "captured": (lambda x: x + nothing.sum(), (P("seeds"),), (x,)),
+    "in a loop": (lambda x: jax.lax.fori_loop(0, 2, lambda _, x: x + nothing.sum(), x), (P("seeds"),), (x,)),
+}
+body, specs, args = cases[sys.argv[2]]
+np.testing.assert_array_equal({"ours": ours, "jax's": jaxs}[sys.argv[1]](body, specs)(*args), x)
+"""
+
+
+def with_empty_arrays(spread: str, case: str) -> int:
+    """The exit status of a program of its own: a crash of the compiler ends the process."""
+    program = [sys.executable, "-c", EMPTY, spread, case]
+    return subprocess.run(program, env=environment(), capture_output=True, timeout=120).returncode
+
+
+@pytest.mark.parametrize("case", ["given", "captured", "in a loop"])
+def test_arrays_without_elements_may_come_from_outside_of_the_program(case):
+    assert with_empty_arrays("ours", case) == 0
+
+
+@pytest.mark.skipif(jax.__version_info__ < (0, 11), reason="it came with jax 0.11")
+def test_jaxs_own_shard_map_still_crashes_on_them():
+    """Where this fails, `Layout.spread` need no longer make them inside (docs/architecture.md)."""
+    assert with_empty_arrays("jax's", "captured") == -11

@@ -228,6 +228,12 @@ def test_a_run_is_trained_by_one_process_at_a_time(short_run):
         train.train(short_run)
 
 
+def test_a_run_goes_on_where_the_system_has_no_locks(tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "fcntl", None)
+    with train._alone_in(tmp_path), train._alone_in(tmp_path / "not even looked at"):
+        pass
+
+
 def test_a_disk_that_fills_up_stops_the_run_in_one_line(short_run, tmp_path, monkeypatch):
     """Not at the check before a save, but while a line is written; the checkpoint before it is whole."""
     append = metrics._append

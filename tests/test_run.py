@@ -3,12 +3,13 @@
 import math
 from importlib import resources
 
+import jax
 import numpy as np
 import pytest
 import yaml
 
 from tests.helpers import METRICS, check_log, command
-from vecpsmbpo import config, metrics
+from vecpsmbpo import config, metrics, versions
 from vecpsmbpo.envs import registry
 
 
@@ -28,9 +29,14 @@ def test_every_task_runs_end_to_end_and_resumes_on_every_backend(name, backend, 
     assert begun.returncode == 0, begun.stderr
     for said in ("memory: ", "compil", "steps/s", "updates/s", "imagined/s", "left ", "saved at step 80 of 80"):
         assert said in begun.stdout
+    assert begun.stdout.startswith(f"{versions.line()}; devices: ")
     result = command("train", "run_dir=run", "total_steps=120", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "resuming at step 80" in result.stdout
+    sessions = metrics.read(tmp_path / "run" / "sessions.jsonl")
+    assert [line.pop("env_steps") for line in sessions] == [0, 80]
+    assert set(sessions[0].pop("devices")) == {jax.devices()[0].device_kind}
+    assert sessions[0] == versions.current()
     settings = config.load(tmp_path / "run")
     assert settings.backend == backend
     check_log(tmp_path / "run", settings)

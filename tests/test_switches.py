@@ -13,7 +13,7 @@ from tests import probes
 from tests.helpers import algorithm, assert_probabilities_follow, tiny
 from tests.test_drivers import make_driver, settings_for
 from tests.test_imagination import constant
-from vecpsmbpo import dynamics, metrics, mixture, posterior
+from vecpsmbpo import dynamics, metrics, mixture, posterior, sac
 from vecpsmbpo.envs import specs
 from vecpsmbpo.train import initial_inputs
 from vecpsmbpo.types import Bandit, Counters, Hyper
@@ -321,6 +321,40 @@ def test_what_is_chosen_can_be_recomputed_from_the_log(adapted):
     assert set(arms_played) == {0, 1}
     with_second = sum((rank + 0.5) / 4 > probs[0] for rank in range(4))
     assert epochs[-1]["real_ratio"] == pytest.approx((RATIOS[0] * (4 - with_second) + RATIOS[1] * with_second) / 4)
+
+
+@pytest.fixture(scope="module")
+def valued():
+    """Members drawn by what their critics promise: settings, driver, state, episodes, and values of a state's seed."""
+    settings, driver, state, lines, _ = run(weights="values", temperature=0.1)
+    parts = driver.layout.specs().seeds
+    values = driver.layout.spread(jax.vmap(driver.algorithm.values), (parts,), parts.key)
+    return settings, driver.algorithm.spec, state, lines, lambda seeds: values(seeds)[0]
+
+
+def test_members_may_be_drawn_by_what_their_critics_promise(valued):
+    """Section 3.3: probabilities are those of the values in the log, and values those of the critics at real starts."""
+    settings, spec, state, lines, values = valued
+    for line in lines:
+        logits = np.array(line["values"]) / settings.temperature
+        expected = np.exp(logits - logits.max())
+        np.testing.assert_allclose(line["probs"], expected / expected.sum(), atol=1e-5)
+    assert not np.any(lines[0]["values"])  # nothing is known before the first start
+    assert len(np.unique(lines[-1]["values"])) == settings.n_members
+    nets, start = sac.make_networks(settings, spec), jnp.zeros(1)  # where every episode begins
+    for member, found in enumerate(values(state.seeds)):
+        agent = jax.tree.map(lambda x, member=member: x[0, member], state.seeds.agents)
+        action = np.tanh(nets.actor.law(agent.actor, start).loc)
+        by_hand = np.min(nets.critic.values(agent.critic, start, action))
+        assert found == pytest.approx(max(by_hand, 0.0), rel=1e-4)
+
+
+def test_no_member_promises_more_than_rewards_allow(valued):
+    settings, _, state, _, values = valued
+    agents = state.seeds.agents
+    beyond = agents.replace(critic=jax.tree.map(lambda x: x + 1e4, agents.critic))
+    best = 1 / (1 - settings.discount)  # of rewards 1 - a² at every step
+    np.testing.assert_allclose(values(state.seeds.replace(agents=beyond)), best, rtol=1e-2)
 
 
 def test_priors_stay_as_they_were_drawn(averaged):

@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Sequence
 
+from vecpsmbpo import crash
 from vecpsmbpo.settings import SettingError, Settings
 
 HELP = """\
@@ -17,6 +18,7 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo eval run_dir=runs/x episodes=10         evaluate it
   vecpsmbpo envs                                    tasks, backends, sizes
   vecpsmbpo theory                                  the paper's theory in numbers, in seconds
+  vecpsmbpo --version                               of this program, jax, mujoco and Python
 
 {groups}
 settings: {settings}
@@ -42,6 +44,11 @@ def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(_help())
         return 0 if arguments else 2
+    if arguments[0] in ("--version", "version"):
+        from vecpsmbpo import versions
+
+        print(versions.line())
+        return 0
     command, rest = arguments[0], arguments[1:]
     if "-h" in rest or "--help" in rest:
         print(_help())
@@ -49,7 +56,8 @@ def _dispatch(arguments: list[str]) -> int:
     if command == "envs":
         return _envs(rest)
     if command == "eval":
-        return _eval(rest)
+        with crash.watched():
+            return _eval(rest)
     if command == "theory":
         from vecpsmbpo.theory import report
 
@@ -57,7 +65,8 @@ def _dispatch(arguments: list[str]) -> int:
     if command == "train":
         multirun = {"-m", "--multirun"} & set(rest)
         overrides = [text for text in rest if text not in ("-m", "--multirun")]
-        return _multirun(overrides) if multirun else _train(overrides)
+        with crash.watched():
+            return _multirun(overrides) if multirun else _train(overrides)
     raise SettingError(f"{command}: no such command; one of train, eval, envs, theory")
 
 
@@ -76,6 +85,7 @@ def _run(settings: Settings) -> int:
         print(f"vecpsmbpo: {error}", file=sys.stderr, flush=True)
         # Not a plain exit: the writer threads of orbax and tensorboardX would each report the same disk again, in
         # tracebacks of their own, while the interpreter ends.
+        crash.end()
         os._exit(2)
 
 
@@ -134,7 +144,7 @@ def _envs(rest: list[str]) -> int:
     for name, task in TASKS.items():
         sizes = map(str, task.sizes) if task.sizes else ("any", "any", "its own")
         options = " ".join(f"env.{option}" for option in config.env_options(name))
-        installed = "yes" if task.installed else f"no: pip install 'vecpsmbpo[{task.extra}]'" if task.extra else "no"
+        installed = "yes" if task.installed else f"no: pip install {task.needs or task.suite}"
         installed = escape(installed)  # rich would read [playground] as markup
         table.add_row(name, ", ".join(task.backends), *sizes, options, task.suite, installed)
     Console(width=150).print(table)

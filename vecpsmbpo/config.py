@@ -20,7 +20,7 @@ from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, Settings, allowed, build, check, check_sweep
 
 CONFIG_FILE = "config.yaml"
-GROUPS = ("env", "algo", "size")
+GROUPS = ("env", "algo", "size", "recipe")
 _DOTTED = {"env": "env_options", "sweep": "sweep"}  # where the settings `env.*` and `sweep.*` are kept
 # What the name of a default run directory already says, or need not say.
 _UNNAMED = frozenset({*GROUPS, "seed", "run_dir", *CHANGEABLE})
@@ -194,7 +194,7 @@ def load(run_dir: str | Path) -> Settings:
     try:
         stored = yaml.safe_load(path.read_text())
         # What the run does not know came to this program after it, and is off by default.
-        return dataclasses.replace(build({**_defaults(), **stored}), run_dir=str(run_dir))
+        return dataclasses.replace(build({**_defaults(), "recipe": "paper", **stored}), run_dir=str(run_dir))
     except OSError:
         raise SettingError(f"run_dir={run_dir}: holds no {CONFIG_FILE}, so no run") from None
     except (KeyError, TypeError, yaml.YAMLError) as error:

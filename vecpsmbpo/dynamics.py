@@ -71,7 +71,7 @@ def init(key: jax.Array, hyper: Hyper, settings: Settings, spec: EnvSpec) -> Mod
 
 
 def scaling(moments: Moments, rows: jax.Array, settings: Settings) -> Scaling:
-    """What whitens the inputs (equation 20) and, with `whiten_targets`, the changes Δs; rewards stay as they are.
+    """What whitens the inputs (equation 20) and, with `whiten_targets`, the outputs: changes Δs and rewards.
 
     What has never varied is left unscaled: there is nothing to learn of it yet, and dividing by a vanishing deviation
     would turn its first change into an explosion.
@@ -79,8 +79,8 @@ def scaling(moments: Moments, rows: jax.Array, settings: Settings) -> Scaling:
     std = jnp.sqrt(moments.deviation / jnp.maximum(rows, 1))
     std = jnp.where(std > 1e-6, std, 1.0)
     size = moments.inputs
-    changes = std[size:] if settings.whiten_targets else jnp.ones_like(std[size:])
-    return Scaling(moments.mean[:size], std[:size], jnp.append(changes, 1.0))
+    outputs = std[size:] if settings.whiten_targets else jnp.ones_like(std[size:])
+    return Scaling(moments.mean[:size], std[:size], outputs)
 
 
 def forward(model: Model, obs: jax.Array, action: jax.Array, *, net: networks.GaussianMLP) -> networks.Prediction:

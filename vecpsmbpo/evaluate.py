@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from vecpsmbpo import checkpoint, config, resources, runtime
+from vecpsmbpo import checkpoint, config, crash, resources, runtime
 from vecpsmbpo.drivers import Driver
 from vecpsmbpo.drivers.common import evaluation_policies
 from vecpsmbpo.settings import SettingError, Settings
@@ -30,6 +30,7 @@ def evaluate(stored: Settings, settings: Settings) -> int:
     stored = replace(stored, devices=settings.devices)
     trained, saved = restore(stored)
     driver = trained if settings == stored else make_driver(settings)
+    crash.doing("evaluating")
     returns = driver.evaluate(saved.state, evaluation_keys(settings, saved.step), settings.eval_episodes)
     who = f"policy: {settings.eval_policy}, {settings.eval_actions} actions"
     table = Table(title=f"{settings.task} ({settings.backend}) at step {saved.step}, {who}")

@@ -1,4 +1,7 @@
-"""What a run writes down: metrics.jsonl, episodes.jsonl and TensorBoard, each epoch and episode exactly once."""
+"""What a run writes down: metrics.jsonl, episodes.jsonl and TensorBoard, each epoch and episode exactly once.
+
+And sessions.jsonl: a line for each time that somebody began, or went on with, the run.
+"""
 
 import json
 import math
@@ -16,6 +19,7 @@ from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
 METRICS_FILE, EPISODES_FILE, TENSORBOARD = "metrics.jsonl", "episodes.jsonl", "tensorboard"
+SESSIONS_FILE = "sessions.jsonl"
 Line = dict[str, Any]
 
 
@@ -30,6 +34,10 @@ class RunLog:
         for name in (METRICS_FILE, EPISODES_FILE):
             _rewind(run_dir / name, env_steps)
         self._tensorboard = SummaryWriter(str(run_dir / TENSORBOARD), purge_step=env_steps + 1)
+
+    def session(self, line: Line) -> None:
+        """Writes down that a session began, and what with."""
+        _append(self._run_dir / SESSIONS_FILE, [line])
 
     def episodes(self, lines: Iterable[Line]) -> None:
         """Writes finished episodes."""
@@ -120,6 +128,8 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
                 "probs": news.probs[step, seed].reshape(-1, settings.n_policies).tolist(),
             }
         )
+        if news.values is not None:
+            lines[-1]["values"] = news.values[step, seed].reshape(-1, settings.n_policies).tolist()
     return lines
 
 

@@ -1,5 +1,6 @@
 """The networks: dynamics (A.1), SAC's actor and twin critic (A.2), TRPO's policy and value function."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ from vecpsmbpo.types import Params
 
 MIN_LOG_VARIANCE, MAX_LOG_VARIANCE = -10.0, 2.0
 MIN_SCALE = 1e-3  # Acme's floor under the standard deviation of the policy
+LOG_PROB_BOUND = 3.8  # arctanh(0.999), where Acme's log-densities of a tanh stop to grow
 
 model_init = nn.initializers.variance_scaling(1.0, "fan_in", "truncated_normal")
 policy_init = nn.initializers.variance_scaling(1.0, "fan_in", "uniform")
@@ -62,25 +64,53 @@ class GaussianMLP(nn.Module):
         return Prediction(mean * scale, log_variance + unit, rest[..., 0] if self.predicts_termination else None)
 
 
+def layer_norm(x: jax.Array) -> jax.Array:
+    """Each row of x [..., H] at mean 0 and variance 1 (Ba et al., 2016).
+
+    Without gain and offset, which the dense layers around it have, and written out: XLA's code for a CPU then costs a
+    third of flax's `LayerNorm` beside products of 64 columns (docs/results.md).
+    """
+    return rms_norm(x - jnp.mean(x, axis=-1, keepdims=True))
+
+
+def rms_norm(x: jax.Array) -> jax.Array:
+    """Each row of x [..., H] at mean square 1 (Zhang and Sennrich, 2019)."""
+    return x * jax.lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + 1e-6)
+
+
+NORMS: dict[str, Callable[[jax.Array], jax.Array]] = {"none": lambda x: x, "layer": layer_norm, "rms": rms_norm}
+
+
 class ReluMLP(nn.Module):
-    """Dense layers with ReLU between them, and a linear output."""
+    """Dense layers with ReLU between them, and a linear output.
+
+    Attributes:
+        norm: of what goes into each ReLU, a name in `NORMS`.
+    """
 
     output_size: int
     hidden_size: int
     hidden_layers: int
+    norm: str = "none"
 
     @nn.compact
     def __call__(self, hidden: jax.Array) -> jax.Array:
         for _ in range(self.hidden_layers):
-            hidden = nn.relu(nn.Dense(self.hidden_size, kernel_init=policy_init)(hidden))
+            hidden = nn.relu(NORMS[self.norm](nn.Dense(self.hidden_size, kernel_init=policy_init)(hidden)))
         return nn.Dense(self.output_size, kernel_init=policy_init)(hidden)
 
 
 class TanhGaussian(NamedTuple):
-    """The law of tanh(u), u ~ Normal(loc, scale²), independently per action; loc and scale [..., A]."""
+    """The law of tanh(u), u ~ Normal(loc, scale²), independently per action.
+
+    Attributes:
+        loc, scale: [..., A].
+        most: |u| beyond which log-densities grow no further.
+    """
 
     loc: jax.Array
     scale: jax.Array
+    most: float = float("inf")
 
     def sample(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Reparameterized action [..., A] and its log-density [...]."""
@@ -88,7 +118,8 @@ class TanhGaussian(NamedTuple):
         pre_tanh = self.loc + self.scale * noise
         log_normal = -0.5 * noise**2 - jnp.log(self.scale) - 0.5 * jnp.log(2 * jnp.pi)
         # log(1 - tanh²u) = 2 (log 2 - u - softplus(-2u)): no cancellation where tanh saturates.
-        log_slope = 2 * (jnp.log(2.0) - pre_tanh - jax.nn.softplus(-2 * pre_tanh))
+        bounded = jnp.clip(pre_tanh, -self.most, self.most)
+        log_slope = 2 * (jnp.log(2.0) - bounded - jax.nn.softplus(-2 * bounded))
         return jnp.tanh(pre_tanh), jnp.sum(log_normal - log_slope, axis=-1)
 
     def mode(self) -> jax.Array:
@@ -97,18 +128,23 @@ class TanhGaussian(NamedTuple):
 
 
 class Actor(nn.Module):
-    """π(a | s), tanh-Gaussian."""
+    """π(a | s), tanh-Gaussian.
+
+    Attributes:
+        most: see `TanhGaussian`.
+    """
 
     action_size: int
     hidden_size: int
     hidden_layers: int
+    most: float = float("inf")
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> TanhGaussian:
         """obs [..., O] -> law of actions [..., A]."""
         outputs = ReluMLP(2 * self.action_size, self.hidden_size, self.hidden_layers)(obs)
         loc, raw_scale = jnp.split(outputs, 2, axis=-1)
-        return TanhGaussian(loc, nn.softplus(raw_scale) + MIN_SCALE)
+        return TanhGaussian(loc, nn.softplus(raw_scale) + MIN_SCALE, self.most)
 
     def law(self, params: Params, obs: jax.Array) -> TanhGaussian:
         """π(· | obs) of these parameters."""
@@ -121,13 +157,14 @@ class TwinCritic(nn.Module):
 
     hidden_size: int
     hidden_layers: int
+    norm: str = "none"
 
     @nn.compact
     def __call__(self, obs: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         """obs [..., O], action [..., A] -> Q_1 [...], Q_2 [...]."""
         inputs = jnp.concatenate([obs, action], axis=-1)
-        first = ReluMLP(1, self.hidden_size, self.hidden_layers, name="first")(inputs)
-        second = ReluMLP(1, self.hidden_size, self.hidden_layers, name="second")(inputs)
+        first = ReluMLP(1, self.hidden_size, self.hidden_layers, self.norm, name="first")(inputs)
+        second = ReluMLP(1, self.hidden_size, self.hidden_layers, self.norm, name="second")(inputs)
         return first[..., 0], second[..., 0]
 
     def values(self, params: Params, obs: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:

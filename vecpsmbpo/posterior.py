@@ -3,7 +3,9 @@
 import jax
 import jax.numpy as jnp
 
-from vecpsmbpo.types import Posterior
+from vecpsmbpo.types import Episode, Posterior
+
+STARTS = 32  # K, episodes whose first observations members are asked about
 
 
 def init(members: int) -> Posterior:
@@ -23,8 +25,21 @@ def credit(posterior: Posterior, member: jax.Array, episode_return: jax.Array, c
     return Posterior(total, compensation, posterior.episodes + credited)
 
 
-def logits(posterior: Posterior, temperature: jax.Array) -> jax.Array:
-    """[N·M] accumulated return / τ (equation 19). τ = ∞ gives the uniform distribution of equation 18."""
+def add_start(starts: jax.Array | None, episode: Episode, obs: jax.Array) -> jax.Array | None:
+    """The ring [K, O] with the first observation [O] of this episode; unchanged at its later steps."""
+    if starts is None:
+        return None
+    place = (episode.index - 1) % STARTS
+    return starts.at[place].set(jnp.where(episode.length == 0, obs, starts[place]))
+
+
+def logits(posterior: Posterior, values: jax.Array | None, temperature: jax.Array) -> jax.Array:
+    """[N·M] accumulated return / τ (equation 19), or value / τ where there are `values` [N·M].
+
+    τ = ∞ gives the uniform distribution of equation 18.
+    """
+    if values is not None:
+        return (values - jnp.max(values)) / temperature
     centred = posterior.returns - jnp.max(posterior.returns)  # before dividing: keeps small differences exact
     return (centred - posterior.compensation) / temperature
 
@@ -43,10 +58,9 @@ def best(posterior: Posterior) -> jax.Array:
     return jnp.argmax(jnp.where(enough, mean, -jnp.inf))
 
 
-def draw(posterior: Posterior, temperature: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def draw(logits: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """A member, [] int, and the distribution [N·M] that it was drawn from."""
-    scores = logits(posterior, temperature)
-    return jax.random.categorical(key, scores), jax.nn.softmax(scores)
+    return jax.random.categorical(key, logits), jax.nn.softmax(logits)
 
 
 def exploration_probability(forced_exploration: jax.Array, episode: jax.Array) -> jax.Array:

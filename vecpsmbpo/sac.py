@@ -19,9 +19,20 @@ class Networks(NamedTuple):
     critic: networks.TwinCritic
 
 
+class Limits(NamedTuple):
+    """The least and the most reward of a step, [] each, as far as they are known."""
+
+    lowest_reward: jax.Array
+    highest_reward: jax.Array
+
+
 def make_networks(settings: Settings, spec: EnvSpec) -> Networks:
     size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
-    return Networks(networks.Actor(spec.action_size, size, layers), networks.TwinCritic(size, layers))
+    most = networks.LOG_PROB_BOUND if settings.bound_log_prob else float("inf")
+    return Networks(
+        actor=networks.Actor(spec.action_size, size, layers, most),
+        critic=networks.TwinCritic(size, layers, settings.critic_norm),
+    )
 
 
 def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> Agent:
@@ -51,14 +62,35 @@ def target_value(
     return reward + discount * (1 - terminated) * (next_q - alpha * next_log_prob)
 
 
+def target_range(limits: Limits, alpha: jax.Array, hyper: Hyper, action_size: int) -> tuple[jax.Array, jax.Array]:
+    """The least and the most that Q can be, [] each, if rewards stay within `limits`.
+
+    At every step the entropy bonus of equations 24 and 29 is at most that of uniform actions, α A log 2, and about that
+    of the target entropy where that is negative. No reward at all, as after a termination, is always possible.
+    """
+    steps = 1 / jnp.maximum(1 - hyper.discount, 1e-6)  # 1 + γ + γ² + …
+    most = jnp.maximum(limits.highest_reward, 0.0) + hyper.discount * alpha * action_size * jnp.log(2.0)
+    least = jnp.minimum(limits.lowest_reward, 0.0) + hyper.discount * alpha * jnp.minimum(hyper.target_entropy, 0.0)
+    return least * steps, most * steps
+
+
 def critic_loss(
-    critic: Params, agent: Agent, batch: Transition, discount: jax.Array, key: jax.Array, *, nets: Networks
+    critic: Params,
+    agent: Agent,
+    batch: Transition,
+    discount: jax.Array,
+    key: jax.Array,
+    *,
+    nets: Networks,
+    bounds: tuple[jax.Array, jax.Array] | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """½ (Q - Q̂)² for both critics (equation 27), and the mean of Q over the batch."""
+    """½ (Q - Q̂)² for both critics (equation 27), Q̂ within `bounds`, and the mean of Q over the batch."""
     next_action, next_log_prob = nets.actor.law(agent.actor, batch.next_obs).sample(key)
     next_q = jnp.minimum(*nets.critic.values(agent.target_critic, batch.next_obs, next_action))
     alpha = jnp.exp(agent.log_alpha)
     target = target_value(batch.reward, batch.terminated, next_q, next_log_prob, alpha, discount)
+    if bounds is not None:
+        target = jnp.clip(target, *bounds)
     first, second = nets.critic.values(critic, batch.obs, batch.action)
     return 0.5 * jnp.mean((first - target) ** 2 + (second - target) ** 2), jnp.mean(first)
 
@@ -72,22 +104,34 @@ def actor_loss(
     return jnp.mean(alpha * log_prob - q), jnp.mean(log_prob)
 
 
-def update(agent: Agent, batch: Transition, hyper: Hyper, key: jax.Array, *, nets: Networks) -> Agent:
-    """One gradient step of critic, actor and temperature, and one of the target critic's average.
+def update(
+    agent: Agent,
+    batch: Transition,
+    hyper: Hyper,
+    key: jax.Array,
+    *,
+    nets: Networks,
+    limits: Limits | None = None,
+    target_every: int = 1,
+) -> Agent:
+    """One gradient step of critic, actor and temperature, and every `target_every` such steps one of the target
+    critic's average.
 
     Args:
         batch: leaves [B, ...].
+        limits: of rewards, if the critics' targets are to be kept within what these allow.
     """
     critic_key, actor_key = jax.random.split(key)
     rate = hyper.policy_learning_rate
 
+    alpha = jnp.exp(agent.log_alpha)
+    bounds = None if limits is None else target_range(limits, alpha, hyper, batch.action.shape[-1])
     critic_value_and_grad = jax.value_and_grad(critic_loss, has_aux=True)
     (loss_q, q_mean), gradient = critic_value_and_grad(
-        agent.critic, agent, batch, hyper.discount, critic_key, nets=nets
+        agent.critic, agent, batch, hyper.discount, critic_key, nets=nets, bounds=bounds
     )
     critic, critic_optimizer = optim.step(gradient, agent.critic_optimizer, agent.critic, rate)
 
-    alpha = jnp.exp(agent.log_alpha)
     actor_value_and_grad = jax.value_and_grad(actor_loss, has_aux=True)
     (loss_pi, log_prob), gradient = actor_value_and_grad(agent.actor, critic, alpha, batch.obs, actor_key, nets=nets)
     actor, actor_optimizer = optim.step(gradient, agent.actor_optimizer, agent.actor, rate)
@@ -96,8 +140,10 @@ def update(agent: Agent, batch: Transition, hyper: Hyper, key: jax.Array, *, net
     gradient = -alpha * (log_prob + hyper.target_entropy)
     log_alpha, alpha_optimizer = optim.step(gradient, agent.alpha_optimizer, agent.log_alpha, rate)
 
+    due = critic_optimizer.count % target_every == 0
+    target_rate = jnp.where(due, hyper.target_update_rate, 0.0)
     target_critic = jax.tree.map(
-        lambda average, new: average + hyper.target_update_rate * (new - average), agent.target_critic, critic
+        lambda average, new: average + target_rate * (new - average), agent.target_critic, critic
     )
     news = AgentStats(
         updates=jnp.ones(()),
@@ -119,12 +165,21 @@ def update(agent: Agent, batch: Transition, hyper: Hyper, key: jax.Array, *, net
     )
 
 
-def updates(agent: Agent, batches: Transition, hyper: Hyper, key: jax.Array, *, nets: Networks) -> Agent:
+def updates(
+    agent: Agent,
+    batches: Transition,
+    hyper: Hyper,
+    key: jax.Array,
+    *,
+    nets: Networks,
+    limits: Limits | None = None,
+    target_every: int = 1,
+) -> Agent:
     """G updates in a row. Args: batches: leaves [G, B, ...]."""
 
     def body(agent, xs):
         batch, key = xs
-        return update(agent, batch, hyper, key, nets=nets), None
+        return update(agent, batch, hyper, key, nets=nets, limits=limits, target_every=target_every), None
 
     count = batches.reward.shape[0]
     return jax.lax.scan(body, agent, (batches, jax.random.split(key, count)))[0]

@@ -40,6 +40,7 @@ class Settings:
     env_options: Options = ()
     algo: str
     size: str
+    recipe: str
     backend: str = _choice("auto", "mjx", "host")
     seed: int = _whole(0, 2**31 - 1)
     num_seeds: int = _whole(1)
@@ -90,6 +91,10 @@ class Settings:
     discount: float = _real(0, 1)
     target_entropy: float = _real()
     target_update_rate: float = _real(0, 1, open_low=True)
+    target_update_every: int = _whole(1)
+    critic_norm: str = _choice("none", "layer", "rms")
+    clip_targets: bool
+    bound_log_prob: bool
     # model and policy in turns (SLBO)
     rounds: int = _whole(1)
     model_steps: int = _whole(1)
@@ -112,6 +117,7 @@ class Settings:
     real_ratio_schedule: str = _choice("constant", "linear", "bandit")
     real_ratio_arms: tuple[float, ...] = _real(0, 1)
     temperature: float = _real(0, open_low=True)
+    weights: str = _choice("returns", "values")
     posterior: str = _choice("sample", "average")
     forced_exploration: float = _real(0)
 
@@ -157,6 +163,11 @@ class Settings:
     def adapts_real_ratio(self) -> bool:
         """Whether λ is chosen online."""
         return self.real_ratio_schedule == "bandit"
+
+    @property
+    def weighs_values(self) -> bool:
+        """Whether members are drawn by what their critics promise, and not by what they have earned."""
+        return self.weights == "values"
 
     @property
     def imagines(self) -> bool:
@@ -350,6 +361,10 @@ def _contradictions(one: Settings) -> Iterator[tuple[bool, str]]:
     yield (
         one.adapts_real_ratio and one.posterior == "average",
         "posterior=average: no policy earns what real_ratio_schedule=bandit would choose by",
+    )
+    yield (
+        (one.alternates or one.plans) and one.weighs_values,
+        f"weights=values: there are no critics with {name}",
     )
     yield one.plan_elites > one.plan_population, f"plan_elites={one.plan_elites}: must be at most plan_population"
     yield (

@@ -3,12 +3,12 @@
 import contextlib
 import dataclasses
 import errno
-import fcntl
 import os
 import shlex
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -18,11 +18,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import algorithms, checkpoint, config, envs, health, metrics, resources, runtime
+from vecpsmbpo import algorithms, checkpoint, config, crash, envs, health, metrics, resources, runtime, versions
 from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.types import Hyper, TrainState
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 # An epoch that takes longer than this is run in chunks of about half of it, to show progress and to heed signals.
 LONG_EPOCH_S = 20.0
@@ -87,6 +92,7 @@ def train(settings: Settings) -> int:
         run_dir.mkdir(parents=True, exist_ok=True)
         with _alone_in(run_dir), _heeding_signals() as stop:
             config.save(settings, run_dir)
+            crash.doing("making the first state", run_dir)
             return _Run(settings, driver, shapes, memory).go(stop)
 
 
@@ -123,6 +129,7 @@ class _Run:
                 if self.frozen.all():
                     self.display.say("every lane is frozen: there is nothing to go on with")
                     return self._status
+                self.log.session({"env_steps": self.env_steps, **versions.current(), "devices": self._devices()})
                 # At once, and not after hours.
                 resources.check_disk(self.run_dir, self.state, settings.total_steps)
                 if self.saved_step is None:
@@ -136,8 +143,14 @@ class _Run:
             self.log.close()
             self.checkpoints.close()
 
+    def _devices(self) -> list[str]:
+        """What those are that the run uses: `cpu`, `NVIDIA H100 80GB HBM3`."""
+        return [device.device_kind for device in self.driver.layout.mesh.devices.flat]
+
     def _introduce(self) -> None:
         settings, layout = self.settings, self.driver.layout
+        devices = ", ".join(f"{count} × {kind}" for kind, count in Counter(self._devices()).items())
+        self.display.say(f"{versions.line()}; devices: {devices}")
         swept = "".join(f"{len(values)} values of {name} × " for name, values in settings.sweep)
         self.display.say(
             f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × {swept}"
@@ -154,7 +167,9 @@ class _Run:
     def _compile(self) -> None:
         cached = "; the compilation cache makes this short next time" if self.settings.compile_cache else ""
         self.display.say(f"compiling the training program{cached} …")
+        crash.doing("compiling the training program")
         self.driver.compile(self.state)
+        crash.doing("training")
         self.display.say(f"compiled in {self.driver.compile_seconds:.1f} s")
 
     def _chunk(self) -> None:
@@ -310,7 +325,10 @@ def _heeding_signals() -> Iterator[_Stop]:
 
 @contextlib.contextmanager
 def _alone_in(run_dir: Path) -> Iterator[None]:
-    """Keeps a second process from writing into the same run, as long as this one lives."""
+    """Keeps a second process from writing into the same run, as long as this one lives; where there are locks."""
+    if fcntl is None:
+        yield
+        return
     handle = os.open(run_dir, os.O_RDONLY)
     try:
         with contextlib.suppress(OSError):  # some network file systems have no locks

@@ -189,6 +189,7 @@ class Episode(struct.PyTreeNode):
         member: [] int, n·M + m of the acting policy; -1 where all of them act (`posterior=average`).
         random: [] bool, actions are uniform and the return is not credited.
         probs: [N·M], the distribution that `member` was drawn from.
+        values: [N·M] that it was made of (`weights=values`), or None.
         episode_return, length: [] so far.
     """
 
@@ -197,12 +198,16 @@ class Episode(struct.PyTreeNode):
     member: jax.Array
     random: jax.Array
     probs: jax.Array
+    values: jax.Array | None
     episode_return: jax.Array
     length: jax.Array
 
 
 class EpisodeEnd(struct.PyTreeNode):
-    """One real step's news for `episodes.jsonl`: meaningful where `done`. Every leaf [] but probs [N·M]."""
+    """One real step's news for `episodes.jsonl`: meaningful where `done`.
+
+    Shapes: probs and values (or None) [N·M]; every other leaf [].
+    """
 
     done: jax.Array
     index: jax.Array
@@ -212,24 +217,30 @@ class EpisodeEnd(struct.PyTreeNode):
     episode_return: jax.Array
     length: jax.Array
     probs: jax.Array
+    values: jax.Array | None
 
     @classmethod
-    def blank(cls, shape: tuple[int, ...], n_members: int) -> "EpisodeEnd":
+    def blank(cls, shape: tuple[int, ...], settings: Settings) -> "EpisodeEnd":
         """Room for the news of `shape` steps."""
         flag, count, number = (jnp.zeros(shape, dtype) for dtype in (bool, jnp.int32, jnp.float32))
-        probs = jnp.zeros((*shape, n_members))
-        return cls(flag, count, count, flag, flag, number, count, probs)
+        probs = jnp.zeros((*shape, settings.n_members))
+        values = probs if settings.weighs_values else None
+        return cls(flag, count, count, flag, flag, number, count, probs, values)
 
 
 class Moments(struct.PyTreeNode):
-    """Running mean and sum of squared deviations of (observation, action, Δs) over D_E, [2 O + A] each (Welford).
+    """Running moments of (observation, action, Δs, r) over D_E (Welford).
 
     Attributes:
+        mean, deviation: [2 O + A + 1] each; a deviation is a sum of squares.
+        lowest_reward, highest_reward: [], of D_E and 0.
         inputs: O + A.
     """
 
     mean: jax.Array
     deviation: jax.Array
+    lowest_reward: jax.Array
+    highest_reward: jax.Array
     inputs: int = struct.field(pytree_node=False)
 
 
@@ -262,6 +273,7 @@ class SeedState(struct.PyTreeNode):
         imagined: [P, C_M, F], D_M^{n,m}: one ring per member.
         moments: of D_E, for whitening.
         posterior, episode: who acts, and how it is going.
+        starts: [K, O], the first observations of the last K episodes (`weights=values`), or None.
         memory: what acting remembers within an episode.
         bandit: which chooses λ; None where nothing is chosen.
         epoch_return, epoch_episodes: [], sum and number of the returns of the episodes that ended this epoch.
@@ -279,6 +291,7 @@ class SeedState(struct.PyTreeNode):
     moments: Moments
     posterior: Posterior
     episode: Episode
+    starts: jax.Array | None
     memory: Any
     bandit: Bandit | None
     epoch_return: jax.Array

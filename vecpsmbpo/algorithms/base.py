@@ -60,6 +60,10 @@ class Algorithm(ABC):
         """What is remembered when an episode begins."""
         return ()
 
+    def values(self, state: SeedState) -> jax.Array | None:
+        """[N·M] what each member promises, where `weights=values`, or None."""
+        return None
+
     def imagined_rows(self, counters: Counters, enabled: jax.Array) -> jax.Array:
         """The counter of `counters` after `refresh`."""
         return counters.imagined_rows
@@ -75,6 +79,7 @@ class Algorithm(ABC):
         settings, spec, layout = self.settings, self.spec, self.layout
         key, model_key, agent_key, draw_key = jax.random.split(key, 4)
         members = posterior.init(settings.n_members)
+        values = jnp.zeros(settings.n_members) if settings.weighs_values else None  # no episode has begun yet
         size = spec.obs_size + spec.action_size
         ring = replay.init(imagination.ring_capacity(settings), spec.obs_size, spec.action_size)
         return SeedState(
@@ -87,9 +92,10 @@ class Algorithm(ABC):
             real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
             newest=ring[0],
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
-            moments=Moments(jnp.zeros(size + spec.obs_size), jnp.zeros(size + spec.obs_size), inputs=size),
+            moments=_no_moments(size, spec.obs_size),
             posterior=members,
-            episode=self._begin_episode(members, hyper, jnp.int32(1), jnp.int32(1), jnp.bool_(True), draw_key),
+            episode=self._begin_episode(members, values, hyper, jnp.int32(1), jnp.int32(1), jnp.bool_(True), draw_key),
+            starts=jnp.zeros((posterior.STARTS, spec.obs_size)) if settings.weighs_values else None,
             memory=self.memory(),
             bandit=mixture.init(settings) if settings.adapts_real_ratio else None,
             epoch_return=jnp.zeros(()),
@@ -140,6 +146,7 @@ class Algorithm(ABC):
             episode_return=total,
             length=length,
             probs=episode.probs,
+            values=episode.values,
         )
         counts = done & ~episode.random
         members = posterior.credit(state.posterior, episode.member, total, counts)
@@ -149,7 +156,9 @@ class Algorithm(ABC):
             bandit = jax.tree.map(partial(jnp.where, counts), credited, bandit)
         random = counters.env_steps + 1 < self.settings.warmup_steps
         index, warmups = episode.index + 1, episode.warmups + random
-        following = self._begin_episode(members, state.hyper, index, warmups, random, key)
+        starts = posterior.add_start(state.starts, episode, transition.obs)
+        values = self.values(state.replace(starts=starts))
+        following = self._begin_episode(members, values, state.hyper, index, warmups, random, key)
         running = episode.replace(episode_return=total, length=length)
         state = state.replace(
             real=replay.add(state.real, row[None], counters.env_steps),
@@ -157,6 +166,7 @@ class Algorithm(ABC):
             moments=_welford(state.moments, self._unpack(row), counters.env_steps),
             posterior=members,
             episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
+            starts=starts,
             memory=jax.tree.map(partial(jnp.where, done), self.memory(), state.memory),
             bandit=bandit,
             epoch_return=state.epoch_return + jnp.where(done, total, 0.0),
@@ -179,15 +189,15 @@ class Algorithm(ABC):
     def _unpack(self, rows: jax.Array) -> Transition:
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
 
-    def _begin_episode(self, members, hyper: Hyper, index, warmups, random, key: jax.Array) -> Episode:
-        member, probs = posterior.draw(members, hyper.temperature, key)
+    def _begin_episode(self, members, values, hyper: Hyper, index, warmups, random, key: jax.Array) -> Episode:
+        member, probs = posterior.draw(posterior.logits(members, values, hyper.temperature), key)
         if self.settings.posterior == "average":
             member = jnp.int32(-1)
         after_warmup = jnp.maximum(index - warmups, 1)
         explores = posterior.exploration_probability(hyper.forced_exploration, after_warmup)
         random |= jax.random.bernoulli(jax.random.fold_in(key, 1), explores)
         zero = jnp.zeros(())
-        return Episode(index, warmups, member, random, probs, episode_return=zero, length=jnp.int32(0))
+        return Episode(index, warmups, member, random, probs, values, episode_return=zero, length=jnp.int32(0))
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
@@ -225,20 +235,32 @@ class Algorithm(ABC):
         split = dynamics.Split.draw(split_key, rows, settings.replay_capacity, settings.validation_block)
         whitening = dynamics.scaling(state.moments, rows, settings)
 
-        def fit(model, key):
-            return dynamics.fit(model, state.real, split, whitening, state.hyper, key, settings=settings, spec=spec)
+        def fit(model, key, real, split, whitening, hyper):
+            return dynamics.fit(model, real, split, whitening, hyper, key, settings=settings, spec=spec)
 
-        keys = self.layout.keys(fit_key, self.layout.model_ids())
+        def fitted(models):
+            keys = self.layout.keys(fit_key, self.layout.model_ids())
+            return self.layout.map_local(fit, models, keys, shared=(state.real, split, whitening, state.hyper))
+
         # Only the models go through the branch: see `drivers.common.observe_and_learn`.
-        fitted = jax.lax.cond(
-            enabled, lambda models: self.layout.map_local(fit, models, keys), lambda x: x, state.models
-        )
-        return state.replace(models=fitted)
+        return state.replace(models=jax.lax.cond(enabled, fitted, lambda models: models, state.models))
+
+
+def _no_moments(inputs: int, obs_size: int) -> Moments:
+    """Of no rows."""
+    zeros, zero = jnp.zeros(inputs + obs_size + 1), jnp.zeros(())
+    return Moments(zeros, zeros, lowest_reward=zero, highest_reward=zero, inputs=inputs)
 
 
 def _welford(moments: Moments, transition: Transition, rows: jax.Array) -> Moments:
     """Moments of one more row after `rows` of them."""
-    value = jnp.concatenate([transition.obs, transition.action, transition.next_obs - transition.obs])
+    obs, action, reward, next_obs, _ = transition
+    value = jnp.concatenate([obs, action, next_obs - obs, reward[None]])
     change = value - moments.mean
     mean = moments.mean + change / (rows + 1)
-    return moments.replace(mean=mean, deviation=moments.deviation + change * (value - mean))
+    return moments.replace(
+        mean=mean,
+        deviation=moments.deviation + change * (value - mean),
+        lowest_reward=jnp.minimum(moments.lowest_reward, reward),
+        highest_reward=jnp.maximum(moments.highest_reward, reward),
+    )

@@ -4,6 +4,7 @@ MBPO and SAC are settings of it: one policy that learns in all models (`rollout_
 real data alone (λ = 1, equation 15). They share every line, so that comparisons differ in the posterior only.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -39,7 +40,8 @@ class PsMbpo(Algorithm):
         if self.settings.eval_policy == "best":
             member = posterior.best(state.posterior)
         else:
-            member, _ = posterior.draw(state.posterior, state.hyper.temperature, key)
+            logits = posterior.logits(state.posterior, self.values(state), state.hyper.temperature)
+            member, _ = posterior.draw(logits, key)
         return self.layout.ask(member, state.agents.actor)
 
     def evaluation_action(
@@ -55,6 +57,28 @@ class PsMbpo(Algorithm):
             return self._of_mixture(policy, obs, key, sampled=sampled), ()
         modes = jax.vmap(lambda params: self._actor.law(params, obs).mode())(policy)
         return self.layout.mean_over_members(modes), ()
+
+    def values(self, state: SeedState) -> jax.Array | None:
+        """[N·M] min(Q_1, Q_2) of each member's mean action, averaged over the starts of the last episodes.
+
+        The paper offers value functions in place of accumulated returns (section 3.3, after Agarwal and Zhang, 2022):
+        what a member expects to earn, in its own model's world, rather than what it has earned. Members are comparable
+        since all are asked about the same states, the real starts, and since none may promise more or less than the
+        rewards seen so far allow: a critic that runs away is not preferred for it.
+        """
+        if not self.settings.weighs_values:
+            return None
+        nets, moments = sac.make_networks(self.settings, self.spec), state.moments
+        known = jnp.arange(posterior.STARTS) < state.episode.index
+
+        def value(agent: Agent) -> jax.Array:
+            action = nets.actor.law(agent.actor, state.starts).mode()
+            q = jnp.minimum(*nets.critic.values(agent.critic, state.starts, action))
+            return jnp.sum(jnp.where(known, q, 0.0)) / jnp.sum(known)
+
+        limits = sac.Limits(moments.lowest_reward, moments.highest_reward)
+        least, most = sac.target_range(limits, jnp.float32(0.0), state.hyper, self.spec.action_size)
+        return jnp.clip(self.layout.all_members(jax.vmap(value)(state.agents)), least, most)
 
     def _of_member(
         self, member: jax.Array, actors: Params, obs: jax.Array, key: jax.Array, *, sampled: bool = True
@@ -107,20 +131,20 @@ class PsMbpo(Algorithm):
         shared = settings.rollout_models == "any"
         models = (layout.all_models_for_members if shared else layout.models_of_members)(state.models)
 
-        def real_states(key):
-            return imagination.start_states(state.real, counters.env_steps, key, chunk, spec)
+        def real_states(keys):
+            """[P_local] -> [P_local, chunk, O]; for all members at once, as `learn` draws minibatches."""
+            draw = partial(imagination.start_states, state.real, counters.env_steps, count=chunk, spec=spec)
+            return jax.vmap(draw)(keys)
 
-        def advance(model, actor, obs, key):
-            step_key, fresh_key = jax.random.split(key)
-            transition = imagination.step(model, actor, obs, step_key, settings=settings, spec=spec)
-            ended = transition.terminated[:, None]
-            return replay.pack(transition), jnp.where(ended, real_states(fresh_key), transition.next_obs)
+        def advance(model, actor, obs, fresh, key):
+            transition = imagination.step(model, actor, obs, key, settings=settings, spec=spec)
+            return replay.pack(transition), jnp.where(transition.terminated[:, None], fresh, transition.next_obs)
 
         def step(t, carry):
             imagined, sound, obs, rows, key = carry
-            rows_now, obs = layout.map_local(
-                advance, models, state.agents.actor, obs, layout.keys(jax.random.fold_in(key, t), ids)
-            )
+            keys = jax.vmap(jax.random.split)(layout.keys(jax.random.fold_in(key, t), ids))
+            fresh = real_states(keys[:, 1])
+            rows_now, obs = layout.map_local(advance, models, state.agents.actor, obs, fresh, keys[:, 0])
             finite = jnp.all(jnp.isfinite(rows_now), axis=-1)
             imagined = replay.add(imagined, jnp.where(finite[..., None], rows_now, 0.0), rows)
             return imagined, sound & jnp.all(finite, axis=-1), obs, rows + chunk, key
@@ -128,7 +152,7 @@ class PsMbpo(Algorithm):
         def rollout(c, carry):
             imagined, sound, rows = carry
             start_key, step_key = jax.random.split(jax.random.fold_in(key, c))
-            obs = jax.vmap(real_states)(layout.keys(start_key, ids))
+            obs = real_states(layout.keys(start_key, ids))
             imagined, sound, _, rows, _ = jax.lax.fori_loop(0, horizon, step, (imagined, sound, obs, rows, step_key))
             return imagined, sound, rows
 
@@ -158,10 +182,15 @@ class PsMbpo(Algorithm):
             state.imagined, ratios, layout.keys(batch_key, ids)
         )
 
-        def update(agent, batches, key):
-            return sac.updates(agent, batches, state.hyper, key, nets=nets)
+        settings, moments = self.settings, state.moments
+        limits = sac.Limits(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
 
-        return layout.map_local(update, state.agents, batches, layout.keys(update_key, ids))
+        def update(agent, batches, key, hyper, limits):
+            every = settings.target_update_every
+            return sac.updates(agent, batches, hyper, key, nets=nets, limits=limits, target_every=every)
+
+        keys = layout.keys(update_key, ids)
+        return layout.map_local(update, state.agents, batches, keys, shared=(state.hyper, limits))
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings

@@ -1,5 +1,6 @@
 """SLBO (Luo et al., 2019) for one seed: one model and one policy, which learn in turns at every refresh."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -43,28 +44,27 @@ class Slbo(Algorithm):
         layout, rows = self.layout, counters.env_steps
         whitening = dynamics.scaling(state.moments, rows, self.settings)
 
-        def round_(learned, key):
-            model, agent = learned
-            model_key, policy_key = jax.random.split(key)
-            model = multistep.fit(
-                model, state.real, rows, state.hyper, model_key, settings=self.settings, spec=self.spec
-            )
+        def learn(model, agent, key, real, whitening, hyper):
+            def round_(learned, key):
+                model, agent = learned
+                model_key, policy_key = jax.random.split(key)
+                model = multistep.fit(model, real, rows, hyper, model_key, settings=self.settings, spec=self.spec)
 
-            def policy_step(agent, key):
-                rollout_key, update_key = jax.random.split(key)
-                rollouts = self.rollouts(counters, state.real, model, agent.policy, rollout_key)
-                discount = state.hyper.discount
-                return trpo.update(agent, rollouts, discount, update_key, settings=self.settings, nets=self._nets), None
+                def policy_step(agent, key):
+                    rollout_key, update_key = jax.random.split(key)
+                    rollouts = self.rollouts(counters, real, model, agent.policy, rollout_key)
+                    step = partial(trpo.update, settings=self.settings, nets=self._nets)
+                    return step(agent, rollouts, hyper.discount, update_key), None
 
-            agent, _ = jax.lax.scan(policy_step, agent, jax.random.split(policy_key, self.settings.policy_steps))
-            return (model, agent), None
+                agent, _ = jax.lax.scan(policy_step, agent, jax.random.split(policy_key, self.settings.policy_steps))
+                return (model, agent), None
 
-        def learn(model, agent, key):
             model = model.replace(scaling=whitening)
             return jax.lax.scan(round_, (model, agent), jax.random.split(key, self.settings.rounds))[0]
 
         def learned(models, agents):
-            return layout.map_local(learn, models, agents, layout.keys(key, layout.member_ids()))
+            keys = layout.keys(key, layout.member_ids())
+            return layout.map_local(learn, models, agents, keys, shared=(state.real, whitening, state.hyper))
 
         models, agents = jax.lax.cond(enabled, learned, lambda *same: same, state.models, state.agents)
         return state.replace(models=models, agents=agents)

@@ -6,7 +6,6 @@ compiled program serves chunks of any length, and how a run is cut into chunks d
 is undone in a lane where something stops being finite (`health`): its news are none.
 """
 
-import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +22,6 @@ from vecpsmbpo.layout import SEEDS, Layout
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
 
 SHARED, BY_SEED = PartitionSpec(), PartitionSpec(SEEDS)
-COMPILER_STACK = 64 * 2**20  # bytes
 
 
 class Returns(NamedTuple):
@@ -78,17 +76,12 @@ class Driver(Protocol):
 def compiled(programs: Sequence[tuple[Any, tuple]]) -> tuple[list[Any], float]:
     """Jitted functions and the arguments (or shapes) of each, compiled at once; and the seconds it took.
 
-    XLA compiles outside of Python's lock: together they cost the longest one. It recurses deeper than a thread's usual
-    stack allows (jax 0.11.2 crashes).
+    XLA compiles outside of Python's lock: together they cost the longest one.
     """
     began = time.perf_counter()
     lowered = [program.lower(*arguments) for program, arguments in programs]
-    usual = threading.stack_size(COMPILER_STACK)
-    try:
-        with ThreadPoolExecutor() as pool:
-            executables = list(pool.map(lambda program: program.compile(), lowered))
-    finally:
-        threading.stack_size(usual)
+    with ThreadPoolExecutor() as pool:
+        executables = list(pool.map(lambda program: program.compile(), lowered))
     return executables, time.perf_counter() - began
 
 

@@ -94,7 +94,7 @@ class ScanDriver:
             return state, jax.tree.map(lambda all_, new: all_.at[index].set(new), log, news)
 
         shape = (settings.epoch_steps // settings.stride, settings.stride, state.env.obs.shape[0])
-        log = EpisodeEnd.blank(shape, settings.n_members)
+        log = EpisodeEnd.blank(shape, settings)
         return jax.lax.fori_loop(0, strides, stride, (state, log))
 
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:

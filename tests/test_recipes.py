@@ -1,0 +1,114 @@
+"""The stabilisers of `recipe=stable`, each by hand, and that `recipe=paper` has none of them at any size."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vecpsmbpo import config, networks, sac
+from vecpsmbpo.envs import registry, specs
+from vecpsmbpo.types import Hyper, Transition
+
+from .helpers import tiny
+
+OFF = {
+    "whiten_targets": False,
+    "critic_norm": "none",
+    "clip_targets": False,
+    "bound_log_prob": False,
+    "target_update_every": 1,
+}
+
+
+@pytest.mark.parametrize("env", list(registry.TASKS))
+@pytest.mark.parametrize("size", ["tiny", "cpu", "paper"])
+def test_the_paper_s_recipe_has_no_stabiliser_at_any_size(env, size):
+    options = [f"env.{name}=x" for name in config.env_options(env)]
+    settings = config.compose([f"env={env}", f"size={size}", "recipe=paper", *options])
+    assert {name: getattr(settings, name) for name in OFF} == OFF
+    assert settings.recipe == "paper"
+
+
+def test_a_laptop_takes_the_stable_recipe_and_the_command_line_wins():
+    assert config.compose(["size=cpu"]).recipe == "stable"
+    assert config.compose(["size=cpu"]).critic_norm == "layer"
+    assert config.compose(["size=cpu", "critic_norm=none"]).critic_norm == "none"
+
+
+def test_layer_norm_by_hand():
+    # (1, 3, 5, 3) has mean 3 and variance 2; (1, 1, 1, 5) has mean square 7.
+    close = partial(np.testing.assert_allclose, rtol=1e-5)
+    close(networks.layer_norm(jnp.array([1.0, 3.0, 5.0, 3.0])), np.array([-2, 0, 2, 0]) / 2**0.5)
+    close(networks.rms_norm(jnp.array([1.0, 1.0, 1.0, 5.0])), np.array([1, 1, 1, 5]) / 7**0.5)
+
+
+def test_layer_norm_does_not_lose_small_differences_beside_a_large_mean():
+    """By the difference of two large squares, they would be rounding."""
+    row = 1e4 + np.array([-1.0, 0.0, 1.0, 0.0])
+    np.testing.assert_allclose(networks.layer_norm(jnp.asarray(row, jnp.float32)), [-(2**0.5), 0, 2**0.5, 0], rtol=1e-3)
+
+
+@pytest.mark.parametrize("norm", ["layer", "rms"])
+def test_a_normed_critic_cannot_grow_with_its_input(norm, key):
+    """What lets critics run away: a ReLU network is linear in an input that leaves the data."""
+
+    def rise(norm):
+        critic = networks.TwinCritic(16, 2, norm)
+        near, far = jnp.ones(4), 1e4 * jnp.ones(4)
+        params = critic.init(key, near, jnp.zeros(1))
+        return abs(critic.values(params, far, jnp.zeros(1))[0]) / abs(critic.values(params, near, jnp.zeros(1))[0])
+
+    assert rise("none") > 1e3
+    assert rise(norm) < 10
+
+
+def test_the_range_of_targets_by_hand():
+    # γ = 0.9: ten steps. Rewards in [-1, 2]; α = 0.5, two actions: a bonus of up to 0.9 · 0.5 · 2 log 2 a step, and of
+    # 0.9 · 0.5 · (-3) at the target entropy.
+    hyper = Hyper.of(tiny()).replace(discount=jnp.float32(0.9), target_entropy=jnp.float32(-3.0))
+    least, most = sac.target_range(sac.Limits(-1.0, 2.0), 0.5, hyper, 2)
+    assert most == pytest.approx(10 * (2 + 0.9 * np.log(2)), rel=1e-5)
+    assert least == pytest.approx(10 * (-1 - 1.35), rel=1e-5)
+    # Rewards of 1 to 2 only: an episode may end, and earn nothing more.
+    hyper = hyper.replace(target_entropy=jnp.float32(1.0))
+    least, _ = sac.target_range(sac.Limits(1.0, 2.0), 0.5, hyper, 2)
+    assert least == 0
+
+
+def test_clipped_targets_enter_the_critics_loss(key):
+    """γ = 0, r = 5 in a batch, but nothing above 1 was seen: Q̂ = 1, Q = 0, twice ½."""
+    spec, settings = specs.get("hopper"), tiny(clip_targets=True)
+    nets = sac.make_networks(settings, spec)
+    agent = sac.init(key, nets, spec)
+    zero = jax.tree.map(jnp.zeros_like, agent.critic)
+    obs, action = jnp.zeros((1, spec.obs_size)), jnp.zeros((1, spec.action_size))
+    batch = Transition(obs, action, jnp.array([5.0]), obs, jnp.zeros(1))
+    loss, _ = sac.critic_loss(zero, agent, batch, jnp.float32(0.0), key, nets=nets, bounds=(0.0, 1.0))
+    assert loss == pytest.approx(1.0)
+
+
+def test_a_bounded_log_density_stops_growing_where_tanh_saturates(key):
+    free, bounded = networks.TanhGaussian(jnp.array([9.0]), jnp.array([1e-3])), networks.LOG_PROB_BOUND
+    bounded = networks.TanhGaussian(free.loc, free.scale, bounded)
+    # -log(1 - tanh² u) at u = 3.8 is 6.215, and 2 (u - log 2) = 16.61 at 9.
+    assert free.sample(key)[1] - bounded.sample(key)[1] == pytest.approx(16.614 - 6.215, abs=0.02)
+    assert np.tanh(networks.LOG_PROB_BOUND) == pytest.approx(0.999, abs=1e-4)
+    inside = networks.TanhGaussian(jnp.array([1.0]), jnp.array([0.1]))
+    assert inside.sample(key)[1] == inside._replace(most=networks.LOG_PROB_BOUND).sample(key)[1]
+
+
+def test_the_target_critic_moves_at_every_fourth_update(key):
+    spec, settings = specs.get("hopper"), tiny()
+    nets = sac.make_networks(settings, spec)
+    update = jax.jit(partial(sac.update, nets=nets, target_every=4))
+    agent, hyper = sac.init(key, nets, spec), Hyper.of(settings)
+    obs = jnp.ones((2, spec.obs_size))
+    batch = Transition(obs, jnp.zeros((2, spec.action_size)), jnp.ones(2), obs, jnp.zeros(2))
+    moved = []
+    for step in range(8):
+        before, agent = agent, update(agent, batch, hyper, jax.random.fold_in(key, step))
+        same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), before.target_critic, agent.target_critic)
+        moved.append(not all(jax.tree.leaves(same)))
+    assert moved == [False, False, False, True] * 2
