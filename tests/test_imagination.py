@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from tests.helpers import algorithm, initial, tiny
-from vecpsmbpo import replay
+from vecpsmbpo import health, replay
 from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.types import Counters, EnvSpec, Transition
 
@@ -29,10 +29,10 @@ def imagined():
     return imagine(tiny(n_models=N, n_policies=M, rollout_starts=8, horizon_first=3, horizon_last=3))
 
 
-def imagine(settings):
-    """The rows that one refresh adds for every member, and D_E.
+def imagine(settings, change=1.0):
+    """The rows that one refresh adds for every member, D_E, and what it says of its health.
 
-    Every model n adds n + 1 to obs[0] and pays n; every policy acts near tanh(index / 10).
+    Every model n adds (n + 1) · change to obs[0] and pays n; every policy acts near tanh(index / 10).
     """
     learner = algorithm(settings, SPEC)
     layout = learner.layout
@@ -42,7 +42,7 @@ def imagine(settings):
 
     def model_params(n):
         quiet = jnp.full(3, -1e3)
-        return jnp.concatenate([jnp.array([n + 1.0, 0.0, n]), quiet])
+        return jnp.concatenate([jnp.array([(n + 1) * change, 0.0, n]), quiet])
 
     outputs = jnp.stack([model_params(n) for n in range(N)])[None]
     actions = jnp.stack([jnp.array([i / 10, -1e3]) for i in range(settings.n_members)])[None]
@@ -66,7 +66,7 @@ def imagine(settings):
     added = settings.horizon_last * settings.rollout_starts
     rows = after.imagined[0, : settings.n_members, :added]
     assert int(learner.imagined_rows(counters, jnp.bool_(True))) == added
-    return [replay.unpack(member, 2, 1) for member in rows], np.asarray(after.real[0])
+    return [replay.unpack(member, 2, 1) for member in rows], np.asarray(after.real[0]), after.health
 
 
 def _train_state(seeds):
@@ -115,9 +115,22 @@ def test_a_rollout_that_terminates_is_stored_and_begins_again_from_a_real_state(
     assert np.isin(data.obs[16:24, 1], np.arange(ROWS)).all()
 
 
+def test_what_a_model_makes_infinite_is_noted_and_not_stored(imagined):
+    """Model 0 comes to -3e38 within three steps; the others pass float32's -3.4e38 at their second, n = 1 first."""
+    assert int(imagined[2].seen[0]) == health.NOWHERE
+    settings = tiny(n_models=N, n_policies=M, rollout_starts=8, horizon_first=3, horizon_last=3)
+    rows, _, after = imagine(settings, change=-1e38)
+    expected = health.note(health.init(), health.IMAGINED, jnp.bool_(True), M)  # the first member of model 1
+    assert int(after.seen[0]) == int(expected.seen)
+    for member, data in enumerate(rows):
+        assert all(np.isfinite(leaf).all() for leaf in data)
+        lost = [t for t in range(3) if not np.any(data.next_obs[8 * t : 8 * t + 8])]
+        assert lost == ([] if member < M else [1, 2])
+
+
 def test_mbpo_draws_a_model_for_every_row_and_step():
     settings = tiny(algo="mbpo", n_models=N, rollout_starts=900, horizon_first=3, horizon_last=3)
-    (data,), _ = imagine(settings)  # one policy
+    (data,), _, _ = imagine(settings)  # one policy
     n = np.round(data.reward).astype(int)
     assert scipy.stats.chisquare(np.bincount(n, minlength=N)).pvalue > 1e-4
     # The whole answer is one model's.

@@ -1,4 +1,4 @@
-"""A run that is killed, stopped, damaged or diverges, and goes on: through the command line and in this process."""
+"""A run that is killed, stopped or damaged, and goes on: through the command line and in this process."""
 
 import dataclasses
 import errno
@@ -12,12 +12,11 @@ import time
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.helpers import argv, assert_probabilities_follow, check_log, command, environment, tiny
-from vecpsmbpo import checkpoint, config, evaluate, metrics, train
+from vecpsmbpo import config, evaluate, metrics, train
 from vecpsmbpo.settings import SettingError
 
 SMALL = ["env=cartpole_swingup", "size=tiny", "num_seeds=2", "total_steps=200"]
@@ -169,11 +168,13 @@ def short_run(tmp_path_factory):
 
 
 def test_a_policy_is_loaded_from_a_run(short_run):
-    """The member that has earned the most; its mean action against a forward pass written out in numpy."""
+    """The best member; its mean action against a forward pass written out in numpy."""
     settings, act = evaluate.load_policy(short_run.run_dir)
     assert settings == config.load(short_run.run_dir)
     seeds = evaluate.restore(settings)[1].state.seeds
-    member = int(np.argmax(seeds.posterior.returns[0]))
+    earned, episodes = (np.asarray(x[0], float) for x in (seeds.posterior.returns, seeds.posterior.episodes))
+    mean = earned / np.maximum(episodes, 1)
+    member = int(np.argmax(np.where(episodes >= max(1, episodes.sum() / 2 / episodes.size), mean, -np.inf)))
     layers = jax.tree.map(lambda x: np.asarray(x[0, member], float), seeds.agents.actor)["params"]["ReluMLP_0"]
     obs = np.random.default_rng(0).normal(size=(3, 8))
     hidden = obs
@@ -251,27 +252,6 @@ def test_a_disk_that_fills_up_stops_the_run_in_one_line(short_run, tmp_path, mon
     assert evaluate.restore(settings)[1].step == 40
     assert train.train(settings) == 0
     check_log(tmp_path / "run", settings)
-
-
-def test_divergence_stops_the_run_and_says_where(short_run, tmp_path, monkeypatch):
-    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
-    run = train.HostDriver.run
-
-    def poisoned(self, state, strides):
-        state, news = run(self, state, strides)
-        if int(state.counters.env_steps) == 80:
-            alpha = state.seeds.agents.log_alpha.at[0, 3].set(jnp.nan)
-            state = state.replace(seeds=state.seeds.replace(agents=state.seeds.agents.replace(log_alpha=alpha)))
-        return state, news
-
-    monkeypatch.setattr(train.HostDriver, "run", poisoned)
-    with pytest.raises(
-        train.Diverged, match=r"log_alpha of seed 0, policy n = 1, m = 1, .* last good checkpoint: step 40"
-    ):
-        train.train(settings)
-    checkpoints = checkpoint.Checkpoints(tmp_path / "run" / "checkpoints")
-    assert checkpoints.steps() == [0, 40]
-    checkpoints.close()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small disk needs root")

@@ -62,7 +62,8 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
 
 
 def load_policy(run_dir: str | Path) -> tuple[Settings, Callable[[jax.Array], jax.Array]]:
-    """A trained policy, to be used outside of this program: the member of the first seed that has earned the most.
+    """A trained policy, to be used outside of this program: the best member of the first seed
+    (`posterior.best`); with `posterior=average` the mean of all members' actions.
 
     Returns:
         The run's settings, and its mean action as a jitted function: obs [..., O] -> action [..., A] in [-1, 1].

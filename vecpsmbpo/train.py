@@ -161,7 +161,7 @@ class _Run:
         self.display.say(f"memory: {self.memory}")
         where = f"resuming at step {self.env_steps}" if self.env_steps else "starting"
         self.display.say(f"run directory: {self.run_dir} ({where})")
-        for lane in np.flatnonzero(self.frozen):
+        for lane in np.flatnonzero(self.frozen).tolist():
             self.display.say(self._frozen_words(lane))
 
     def _compile(self) -> None:
@@ -237,8 +237,8 @@ class _Run:
     def _note_frozen(self) -> None:
         """Says and writes which lanes were frozen in the chunk that ended."""
         before, self.frozen = self.frozen, np.asarray(health.frozen(self.state.seeds.health))
-        new = np.flatnonzero(self.frozen & ~before)
-        if new.size:
+        new = np.flatnonzero(self.frozen & ~before).tolist()
+        if new:
             lines = metrics.epoch_lines(self.state, self.settings)
             self.log.metrics(sorted((self._last_line(lines[lane], lane) for lane in new), key=lambda x: x["env_steps"]))
         for lane in new:

@@ -156,14 +156,16 @@ class Algorithm(ABC):
             bandit = jax.tree.map(partial(jnp.where, counts), credited, bandit)
         random = counters.env_steps + 1 < self.settings.warmup_steps
         index, warmups = episode.index + 1, episode.warmups + random
-        starts = posterior.add_start(state.starts, episode, transition.obs)
+        stored = self._unpack(row)
+        start = jnp.where(jnp.isfinite(transition.obs), transition.obs, stored.obs)
+        starts = posterior.add_start(state.starts, episode, start)
         values = self.values(state.replace(starts=starts))
         following = self._begin_episode(members, values, state.hyper, index, warmups, random, key)
         running = episode.replace(episode_return=total, length=length)
         state = state.replace(
             real=replay.add(state.real, row[None], counters.env_steps),
             newest=row,
-            moments=_welford(state.moments, self._unpack(row), counters.env_steps),
+            moments=_welford(state.moments, stored, counters.env_steps),
             posterior=members,
             episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
             starts=starts,
