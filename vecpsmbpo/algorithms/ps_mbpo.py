@@ -66,14 +66,15 @@ class PsMbpo(Algorithm):
         since all are asked about the same states, the real starts, and since none may promise more or less than the
         rewards seen so far allow: a critic that runs away is not preferred for it.
         """
-        if not self.settings.weighs_values:
+        starts, moments = state.starts, state.moments
+        if starts is None:
             return None
-        nets, moments = sac.make_networks(self.settings, self.spec), state.moments
+        nets = sac.make_networks(self.settings, self.spec)
         known = jnp.arange(posterior.STARTS) < state.episode.index
 
         def value(agent: Agent) -> jax.Array:
-            action = nets.actor.law(agent.actor, state.starts).mode()
-            q = jnp.minimum(*nets.critic.values(agent.critic, state.starts, action))
+            action = nets.actor.law(agent.actor, starts).mode()
+            q = jnp.minimum(*nets.critic.values(agent.critic, starts, action))
             return jnp.sum(jnp.where(known, q, 0.0)) / jnp.sum(known)
 
         limits = sac.Limits(moments.lowest_reward, moments.highest_reward)
