@@ -167,22 +167,32 @@ def short_run(tmp_path_factory):
     return settings
 
 
-def test_a_policy_is_loaded_from_a_run(short_run):
-    """The best member; its mean action against a forward pass written out in numpy."""
-    settings, act = evaluate.load_policy(short_run.run_dir)
-    assert settings == config.load(short_run.run_dir)
-    seeds = evaluate.restore(settings)[1].state.seeds
-    earned, episodes = (np.asarray(x[0], float) for x in (seeds.posterior.returns, seeds.posterior.episodes))
-    mean = earned / np.maximum(episodes, 1)
-    member = int(np.argmax(np.where(episodes >= max(1, episodes.sum() / 2 / episodes.size), mean, -np.inf)))
-    layers = jax.tree.map(lambda x: np.asarray(x[0, member], float), seeds.agents.actor)["params"]["ReluMLP_0"]
+@pytest.mark.parametrize("posterior", ["sample", "average"])
+def test_a_policy_is_loaded_from_a_run(posterior, short_run, tmp_path):
+    """Of the best member, or of all where they act together; mean actions against a forward pass written in numpy."""
+    shutil.copytree(short_run.run_dir, tmp_path / "run")
+    config.save(dataclasses.replace(short_run, posterior=posterior, run_dir=str(tmp_path / "run")), tmp_path / "run")
+    settings, act = evaluate.load_policy(tmp_path / "run")
+    assert settings == config.load(tmp_path / "run")
+    driver, saved = evaluate.restore(settings)
+    seeds = driver.layout.unpad(saved.state).seeds
+    layers = jax.tree.map(lambda x: np.asarray(x[0], float), seeds.agents.actor)["params"]["ReluMLP_0"]
     obs = np.random.default_rng(0).normal(size=(3, 8))
-    hidden = obs
-    for index in range(settings.policy_hidden_layers):
-        hidden = np.maximum(hidden @ layers[f"Dense_{index}"]["kernel"] + layers[f"Dense_{index}"]["bias"], 0)
-    output = layers[f"Dense_{settings.policy_hidden_layers}"]
-    loc = (hidden @ output["kernel"] + output["bias"])[:, :2]
-    np.testing.assert_allclose(act(obs), np.tanh(loc), atol=1e-5)
+
+    def mean_actions(member):
+        dense = [
+            (layer["kernel"][member], layer["bias"][member])
+            for layer in (layers[f"Dense_{index}"] for index in range(settings.policy_hidden_layers + 1))
+        ]
+        hidden = obs
+        for kernel, bias in dense[:-1]:
+            hidden = np.maximum(hidden @ kernel + bias, 0)
+        return np.tanh((hidden @ dense[-1][0] + dense[-1][1])[:, :2])
+
+    earned, episodes = (np.asarray(x[0], float) for x in (seeds.posterior.returns, seeds.posterior.episodes))
+    mean = np.where(episodes >= max(1, episodes.mean() / 2), earned / np.maximum(episodes, 1), -np.inf)
+    members = [int(mean.argmax())] if posterior == "sample" else range(settings.n_members)
+    np.testing.assert_allclose(act(obs), np.mean([mean_actions(member) for member in members], axis=0), atol=1e-5)
 
 
 def _damage(run_dir: Path, step: int) -> None:

@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -62,8 +64,8 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
 
 
 def load_policy(run_dir: str | Path) -> tuple[Settings, Callable[[jax.Array], jax.Array]]:
-    """A trained policy, to be used outside of this program: the best member of the first seed
-    (`posterior.best`); with `posterior=average` the mean of all members' actions.
+    """A trained policy of the first seed, to be used outside of this program: of the best member (`posterior.best`);
+    with `posterior=average`, where nobody earns anything, the mean of all members' actions.
 
     Returns:
         The run's settings, and its mean action as a jitted function: obs [..., O] -> action [..., A] in [-1, 1].
@@ -74,8 +76,16 @@ def load_policy(run_dir: str | Path) -> tuple[Settings, Callable[[jax.Array], ja
     settings = config.load(run_dir)
     if settings.plans:
         raise SettingError(f"run_dir={run_dir}: algo={settings.algo} plans its actions; there is no policy to load")
-    driver, saved = restore(replace(settings, eval_policy="best", eval_actions="mean"))
+    one = replace(settings, posterior="sample", eval_policy="best", eval_actions="mean")
+    driver, saved = restore(one)
     algorithm, seeds = driver.algorithm, saved.state.seeds
-    policy = jax.tree.map(lambda x: x[0], evaluation_policies(algorithm)(seeds, seeds.key))
     step, key = jnp.int32(0), jax.random.key(0)  # a policy, unlike a plan, needs neither
-    return settings, jax.jit(lambda obs: algorithm.evaluation_action(policy, step, algorithm.memory(), obs, key)[0])
+
+    def action(policy: Any, obs: jax.Array) -> jax.Array:
+        return algorithm.evaluation_action(policy, step, algorithm.memory(), obs, key)[0]
+
+    if settings.posterior == "average":
+        members = jax.tree.map(lambda x: x[0], driver.layout.unpad(saved.state).seeds.agents.actor)
+        return settings, jax.jit(lambda obs: jax.vmap(action, (0, None))(members, obs).mean(axis=0))
+    policy = jax.tree.map(lambda x: x[0], evaluation_policies(algorithm)(seeds, seeds.key))
+    return settings, jax.jit(partial(action, policy))
