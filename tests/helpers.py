@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ METRICS = {
     "actor_loss", "alpha", "q_mean", "real_ratio", "env_steps_per_s", "updates_per_s", "imagined_per_s",
     "seconds",
 }  # fmt: skip
+ONE_DEVICE = "--xla_force_host_platform_device_count=1"
 EPISODE = {
     "seed", "episode", "env_steps", "model", "policy", "return", "length", "terminated", "truncated", "random", "probs",
 }  # fmt: skip
@@ -57,8 +59,8 @@ def command(*arguments: str, cwd: Path, one_thread: bool = False, **kwargs: Any)
 
 def argv(*arguments: str, one_thread: bool = False) -> list[str]:
     """`one_thread` runs on a single core: one device, whose results are reproducible to the bit."""
-    prefix = ["taskset", "-c", "0"] if one_thread else []
-    return [*prefix, sys.executable, "-m", "vecpsmbpo.cli", *arguments]
+    one_core = ["taskset", "-c", "0"] if shutil.which("taskset") else ["env", f"XLA_FLAGS={ONE_DEVICE}"]  # not on macOS
+    return [*(one_core if one_thread else []), sys.executable, "-m", "vecpsmbpo.cli", *arguments]
 
 
 def environment() -> dict[str, str]:
