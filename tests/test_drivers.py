@@ -137,7 +137,8 @@ def test_evaluation_plays_whole_episodes_of_the_mean_action(trained):
 def test_inputs_are_whitened_by_all_the_data(trained):
     _, _, _, state, _ = trained
     rows = np.asarray(state.seeds.real[0, :STEPS])
-    inputs = np.concatenate([rows[:, :2], rows[:, 2:3] - rows[:, :1]], axis=1)  # and the changes
+    # obs and action, and what is predicted from them: the change and the reward.
+    inputs = np.concatenate([rows[:, :2], rows[:, 2:3] - rows[:, :1], rows[:, 3:4]], axis=1)
     moments = jax.tree.map(lambda x: x[0], state.seeds.moments)
     np.testing.assert_allclose(moments.mean, inputs.mean(0), atol=1e-5)
     np.testing.assert_allclose(moments.deviation / STEPS, inputs.var(0), atol=1e-4)
