@@ -1,5 +1,6 @@
 """The command line. Imports JAX only once every argument has been understood."""
 
+import importlib
 import os
 import sys
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo train env=hopper sweep.real_ratio=[0,0.05]      every value at once, in one program
   vecpsmbpo train -m experiment=fig2 size=cpu       the runs behind a figure of the paper
   vecpsmbpo eval run_dir=runs/x episodes=10         evaluate it
+  vecpsmbpo plot runs/x runs/y out=curves.png       learning curves, grouped by what differs
+  vecpsmbpo compare runs/x runs/y                   the same as a table, with intervals
   vecpsmbpo envs                                    tasks, backends, sizes
   vecpsmbpo theory                                  the paper's theory in numbers, in seconds
 
@@ -23,6 +26,10 @@ settings: {settings}
 
 What each setting does stands beside its default in {config}.
 """
+
+
+# Commands that read runs and show them: modules of `vecpsmbpo.look`.
+LOOKS = ("plot", "compare")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,11 +61,13 @@ def _dispatch(arguments: list[str]) -> int:
         from vecpsmbpo.theory import report
 
         return report.run(rest)
+    if command in LOOKS:
+        return importlib.import_module(f"vecpsmbpo.look.{command}").run(rest)
     if command == "train":
         multirun = {"-m", "--multirun"} & set(rest)
         overrides = [text for text in rest if text not in ("-m", "--multirun")]
         return _multirun(overrides) if multirun else _train(overrides)
-    raise SettingError(f"{command}: no such command; one of train, eval, envs, theory")
+    raise SettingError(f"{command}: no such command; one of train, eval, envs, theory, {', '.join(LOOKS)}")
 
 
 def _train(overrides: list[str]) -> int:
