@@ -35,9 +35,7 @@ def epochs(returns: np.ndarray, *, seed: int = 0, epoch: int = 40, **more: Any) 
     ]
 
 
-def episodes(
-    count: int, *, members: tuple[int, int] = (2, 2), seed: int = 0, length: int = 25, **more: Any
-) -> list[dict]:
+def episodes(count: int, members: tuple[int, int] = (2, 2), seed: int = 0, length: int = 25, **more) -> list[dict]:
     """Lines of episodes.jsonl: member `index` acts in turns, the first one is random."""
     n, m = members
     return [

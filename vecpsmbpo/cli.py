@@ -18,6 +18,7 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo eval run_dir=runs/x episodes=10         evaluate it
   vecpsmbpo plot runs/x runs/y out=curves.png       learning curves, grouped by what differs
   vecpsmbpo compare runs/x runs/y                   the same as a table, with intervals
+  vecpsmbpo report runs/x out=report.html           all a run has to show, on one page
   vecpsmbpo envs                                    tasks, backends, sizes
   vecpsmbpo theory                                  the paper's theory in numbers, in seconds
 
@@ -29,7 +30,7 @@ What each setting does stands beside its default in {config}.
 
 
 # Commands that read runs and show them: modules of `vecpsmbpo.look`.
-LOOKS = ("plot", "compare")
+LOOKS = ("plot", "compare", "report")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

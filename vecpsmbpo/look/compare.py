@@ -4,7 +4,7 @@ import csv
 import io
 import itertools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -277,36 +277,34 @@ def caption(rows: Sequence[Row], options: dict[str, Any]) -> str:
 def as_text(rows: Sequence[Row], options: dict[str, Any]) -> str:
     """Tables for a terminal of at least 120 characters, one below the other for each task."""
     console = Console(file=io.StringIO(), width=max(Console().width, 120), highlight=False)
-    for title, part in itertools.groupby(rows, _title):
-        console.print(_text_table(title, list(part)))
+    for (title, *names), body in cells(rows):
+        table = Table(title=escape(title), title_justify="left", title_style="bold", header_style="", box=None)
+        table.add_column("", no_wrap=True)
+        for name in names:
+            table.add_column(name, justify="right", no_wrap=True)
+        for line in body:
+            # Intervals stand below their numbers, to be no wider than a page.
+            table.add_row(*(escape(cell.replace(" [", "\n[")) for cell in line))
+        console.print(table)
     console.print(caption(rows, options), markup=False)
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
-def _text_table(title: str, rows: Sequence[Row]) -> Table:
-    shown = _shown(rows)
-    table = Table(
-        title=escape(title), title_justify="left", title_style="bold", box=None, header_style="", padding=(0, 1)
-    )
-    table.add_column("", overflow="fold")
-    for name in ("seeds", *shown):
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in rows:
-        # Intervals stand below their numbers, to be no wider than a page.
-        cells = [_cell(name, row.cells.get(name)).replace(" [", "\n[") for name in shown]
-        table.add_row(*map(escape, (row.name, _seeds(row), *cells)))
-    return table
+def cells(rows: Sequence[Row]) -> Iterator[tuple[list[str], list[list[str]]]]:
+    """Head and lines of a table for each task, as text."""
+    for title, part in itertools.groupby(rows, _title):
+        lines = list(part)
+        shown = _shown(lines)
+        body = [[row.name, _seeds(row), *(_cell(name, row.cells.get(name)) for name in shown)] for row in lines]
+        yield [title, "seeds", *shown], body
 
 
 def as_markdown(rows: Sequence[Row], options: dict[str, Any]) -> str:
     """As `as_text`, for a README."""
     parts = []
-    for title, part in itertools.groupby(rows, _title):
-        lines = list(part)
-        shown = _shown(lines)
-        table = [[title, "seeds", *shown], ["---", "---:", *["---:" for _ in shown]]]
-        table += [[row.name, _seeds(row), *(_cell(name, row.cells.get(name)) for name in shown)] for row in lines]
-        parts.append("\n".join(f"| {' | '.join(cells)} |" for cells in table))
+    for head, body in cells(rows):
+        lines = [head, ["---", *["---:"] * (len(head) - 1)], *body]
+        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
     return "\n\n".join([*parts, caption(rows, options)]) + "\n"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from vecpsmbpo.settings import SettingError
 
 
-def write(path: Path, make: Callable[[Path], None]) -> None:
+def write(path: Path, make: Callable[[Path], object]) -> None:
     """Has `make` write a file beside `path`, of the same kind, and moves it there.
 
     Raises:
@@ -26,7 +26,7 @@ def write(path: Path, make: Callable[[Path], None]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """As `write`, of a text."""
-    write(path, lambda beside: beside.write_text(text, encoding="utf-8") and None)
+    write(path, lambda beside: beside.write_text(text, encoding="utf-8"))
 
 
 def check_writable(path: Path) -> None:

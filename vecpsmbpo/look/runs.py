@@ -30,7 +30,7 @@ class Log:
     """A JSONL file.
 
     Attributes:
-        columns: by name, [L] floats each, NaN for null; `probs`, and other lists, [L, ...].
+        columns: by name, [L] floats each, NaN for null; `probs`, and other lists, [L, ...] float32.
         damaged: lines that could not be read and are left out; the last one does not count where it is merely
             unfinished, as in a run that is being written.
     """
@@ -199,11 +199,13 @@ def _columns(lines: list[dict[str, Any]]) -> Columns:
 
 def _column(values: list[Any]) -> Array | None:
     """[L] floats, or [L, ...] where the values are lists, flattened. None where they are no numbers of one shape."""
+    column: Array | None
     try:
         column = np.array(values, float)  # None becomes NaN, "inf" infinity
     except (TypeError, ValueError):
         column = _with_gaps(values)
-    return column if column is None or column.ndim < 2 else column.reshape(len(column), -1)
+    # Lists are probabilities of members, most of a log, and float32 themselves.
+    return column if column is None or column.ndim < 2 else column.reshape(len(column), -1).astype(np.float32)
 
 
 def _with_gaps(values: list[Any]) -> Array | None:
@@ -224,9 +226,12 @@ def _concatenate(parts: list[Columns]) -> Columns:
     sizes = [len(next(iter(part.values()))) for part in parts]
 
     def whole(name: str, shape: tuple[int, ...]) -> Array:
-        return np.concatenate(
-            [part.get(name, np.full((n, *shape), np.nan)) for part, n in zip(parts, sizes, strict=True)]
+        kind = np.float32 if shape else float
+        there = (
+            part[name] if name in part else np.full((size, *shape), np.nan, kind)
+            for part, size in zip(parts, sizes, strict=True)
         )
+        return np.concatenate(list(there))
 
     return {name: whole(name, shape) for name, shape in shapes.items()}
 

@@ -26,7 +26,7 @@ INK, FAINT, GRID, PAPER = "#1f2328", "#656d76", "#d8dee4", "#ffffff"
 SUFFIXES = (".png", ".svg", ".pdf")
 MARKS = 8  # markers of a line
 
-RC = {
+RC: Any = {
     "figure.dpi": 100,
     "savefig.dpi": 200,
     "font.family": "sans-serif",
