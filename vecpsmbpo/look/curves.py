@@ -77,7 +77,28 @@ def check_columns(runs: Sequence[Run], option: str, names: Iterable[str]) -> Non
             raise SettingError(f"{option}={name}: the runs have no such column; {closest(name, known)}")
 
 
-def curve(group: Group, x: str, y: str, *, average: str = "mean", smooth: int = 1) -> Curve:
+def bootstrap_band(seeds: Array, average: str = "mean") -> tuple[Array, Array]:
+    """95% bootstrap interval of the average at every point: lower and upper end, [T] each, of curves [S, T]."""
+    return statistics.band(seeds, AVERAGES[average])
+
+
+def error_band(seeds: Array, average: str = "mean") -> tuple[Array, Array]:
+    """One standard error of the mean to either side, as the paper's figures have it; NaN where there is one seed."""
+    mean = seeds.mean(axis=0)
+    with np.errstate(invalid="ignore"):
+        error = seeds.std(axis=0) / np.sqrt(len(seeds) - 1)  # the same as with ddof=1 over sqrt(S); 0 / 0 for S = 1
+    return mean - error, mean + error
+
+
+def curve(
+    group: Group,
+    x: str,
+    y: str,
+    *,
+    average: str = "mean",
+    smooth: int = 1,
+    band: Callable[[Array, str], tuple[Array, Array]] = bootstrap_band,
+) -> Curve:
     """Average and band of a group, from the first point that all of its seeds have to the last.
 
     A frozen seed counts to the end with what it had reached. An epoch without a value (no episode ended in it) counts
@@ -85,8 +106,20 @@ def curve(group: Group, x: str, y: str, *, average: str = "mean", smooth: int = 
 
     Args:
         smooth: how many epochs each point is the mean of.
+        band: of the seeds' curves [S, T] and the average's name.
     """
-    lines = [_line(lane, x, y, smooth) for lane in group.lanes]
+    return joined(group, [_line(lane, x, y, smooth) for lane in group.lanes], x, average=average, band=band)
+
+
+def joined(
+    group: Group,
+    lines: list[tuple[Array, Array]],
+    x: str,
+    *,
+    average: str = "mean",
+    band: Callable[[Array, str], tuple[Array, Array]] = bootstrap_band,
+) -> Curve:
+    """As `curve`, of lines that somebody else has made: where each lane of the group has a value, and the value."""
     lines_with_frozen = list(zip(lines, (lane.frozen for lane in group.lanes), strict=True))
     if any(not len(at) for at, _ in lines):
         nothing = np.empty(0)
@@ -99,7 +132,7 @@ def curve(group: Group, x: str, y: str, *, average: str = "mean", smooth: int = 
         grid = np.linspace(first, max(first, last), POINTS)
     grid = grid[(grid >= first) & (grid <= last)]
     seeds = np.stack([values[np.searchsorted(at, grid, side="right") - 1] for at, values in lines])
-    low, high = statistics.band(seeds, AVERAGES[average])
+    low, high = band(seeds, average)
     return Curve(group.name, grid, AVERAGES[average](seeds, axis=0), low, high, seeds)
 
 

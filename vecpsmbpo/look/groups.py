@@ -68,8 +68,10 @@ def display(name: str, value: Any) -> str:
 
 def label(name: str, value: Any) -> str:
     """A setting with its value: `λ = 0.3`."""
-    shown = display(name, value)
-    return shown if name in ("algo", RUN) else f"{SYMBOLS.get(name, name)} = {shown}"
+    shown, symbol = display(name, value), SYMBOLS.get(name)
+    if name in ("algo", RUN):
+        return shown
+    return f"{symbol} {shown}" if symbol and isinstance(value, str) else f"{symbol or name} = {shown}"
 
 
 def common_task(runs: Sequence[Run]) -> str:
@@ -113,6 +115,8 @@ def _facts(lane: Lane) -> dict[str, Any]:
     """Every setting of a lane, with what its run swept, its task's options, and the run's directory."""
     settings = lane.run.settings
     plain = {name: getattr(settings, name) for name in FIELDS}
+    if settings.real_ratio_schedule != "constant":
+        plain["real_ratio"] = "chosen online" if settings.adapts_real_ratio else "falling from 1"
     options = {f"env.{name}": value for name, value in settings.env_options}
     return {**plain, **options, **lane.values, RUN: _shortest(lane.run.path)}
 

@@ -5,9 +5,9 @@ read as well where there are many.
 """
 
 import itertools
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
@@ -46,42 +46,49 @@ def names(n_models: int, n_policies: int, members: int) -> list[str]:
     return [f"{n}, {m}" for n in range(n_models) for m in range(n_policies)]
 
 
-def draw(lane: Lane, figure: Figure | None = None) -> Figure:
+def draw(lane: Lane) -> Figure:
     """The picture of one lane; it has episodes."""
-    settings, episodes = lane.run.settings, lane.episodes
-    probs, acts = episodes["probs"], acting(episodes, settings.n_policies)
-    figure = figure or Figure(figsize=(4.4, 4.6), layout="constrained")
+    figure = Figure(figsize=(4.4, 4.6), layout="constrained")
     weights, returns = figure.subplots(2, 1, sharex=True, height_ratios=(1.35, 1))
-    between = edges(len(acts))
-    ends = np.append(episodes["episode"][between[:-1]] - 0.5, episodes["episode"][-1] + 0.5)
-    _draw_weights(weights, ends, binned(probs, between), acts)
-    labels = names(settings.n_models, settings.n_policies, probs.shape[1])
-    shown = range(0, len(labels), -(-len(labels) // 12))
-    weights.set_yticks(list(shown), [labels[index] for index in shown])
-    weights.set_ylabel("member n, m" if "," in labels[0] else "member m")
-    _draw_returns(returns, episodes, acts)
+    draw_weights(weights, lane)
+    _draw_returns(returns, lane.episodes, acting(lane.episodes, lane.run.settings.n_policies))
     return figure
 
 
-def _draw_weights(axes: Any, ends: Array, probs: Array, acts: Array) -> None:
-    """Rows shaded by probability [B, N·M]; a dot for the member that acted, where every bin is one episode."""
+def draw_weights(axes: Axes, lane: Lane, x: str = "episode", until: float = np.inf) -> None:
+    """A row for each member, shaded by its probability; a dot for the one that acted, where there is room for dots.
+
+    Args:
+        x: the column that is drawn over, `episode` or `env_steps` (at an episode's end).
+        until: the largest x.
+    """
+    settings = lane.run.settings
+    there = lane.episodes[x] <= until
+    episodes = {name: column[there] for name, column in lane.episodes.items()}
+    acts, between = acting(episodes, settings.n_policies), edges(len(episodes[x]))
+    before = np.concatenate([[0.0], episodes[x]])  # an episode reaches from the end of the one before it to its own
+    ends, probs = before[between], binned(episodes["probs"], between)
     rows = np.arange(probs.shape[1] + 1) - 0.5
     mesh = axes.pcolormesh(ends, rows, probs.T, cmap=SHADES, vmin=0, vmax=max(probs.max(), 1e-9), rasterized=True)
+    title = "probability to act"
     if len(acts) == len(probs):
         centres = (ends[:-1] + ends[1:]) / 2
         look = {"color": style.COLOURS[1], "lw": 0.6, "edgecolors": style.PAPER, "zorder": 3}
         axes.scatter(centres[acts >= 0], acts[acts >= 0], s=np.clip(3000 / len(acts), 8, 26), **look)
-        axes.set_title("probability to act, and who did (dots)", fontweight="normal", fontsize=9)
-    else:
-        axes.set_title("probability to act", fontweight="normal", fontsize=9)
+        title = "probability to act, and who did (dots)"
+    axes.set_title(title, fontweight="normal", fontsize=9)
     axes.grid(False)
     axes.invert_yaxis()
-    bar = axes.figure.colorbar(mesh, ax=axes, pad=0.02, fraction=0.05)
+    labels = names(settings.n_models, settings.n_policies, probs.shape[1])
+    shown = range(0, len(labels), -(-len(labels) // 12))
+    axes.set_yticks(list(shown), [labels[index] for index in shown])
+    axes.set_ylabel("member n, m" if "," in labels[0] else "member m")
+    bar = axes.get_figure().colorbar(mesh, ax=axes, pad=0.02, fraction=0.05)
     bar.outline.set_visible(False)
     bar.ax.yaxis.set_major_locator(MaxNLocator(4))
 
 
-def _draw_returns(axes: Any, episodes: Columns, acts: Array) -> None:
+def _draw_returns(axes: Axes, episodes: Columns, acts: Array) -> None:
     """What every episode earned, hollow where no member is credited with it; of many episodes how they are spread."""
     index, earned, credited = episodes["episode"], episodes["return"], acts >= 0
     if len(index) > 4 * BINS:
@@ -97,7 +104,7 @@ def _draw_returns(axes: Any, episodes: Columns, acts: Array) -> None:
     axes.legend(loc="best", handletextpad=0.4)
 
 
-def _draw_spread(axes: Any, index: Array, earned: Array) -> None:
+def _draw_spread(axes: Axes, index: Array, earned: Array) -> None:
     """Bands of the middle half and of the middle nine tenths of the returns in each bin, and their median."""
     between = edges(len(index))
     parts = [earned[begin:end] for begin, end in itertools.pairwise(between)]
