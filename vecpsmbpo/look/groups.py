@@ -59,6 +59,8 @@ def display(name: str, value: Any) -> str:
     """A value as a person writes it."""
     if name == "algo":
         return ALGORITHMS.get(value, str(value))
+    if name == "real_ratio_schedule":
+        return {"linear": "λ falling from 1", "bandit": "λ chosen online"}.get(value, f"λ {value}")
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int | float):
@@ -69,7 +71,7 @@ def display(name: str, value: Any) -> str:
 def label(name: str, value: Any) -> str:
     """A setting with its value: `λ = 0.3`."""
     shown, symbol = display(name, value), SYMBOLS.get(name)
-    if name in ("algo", RUN):
+    if name in ("algo", "real_ratio_schedule", RUN):
         return shown
     return f"{symbol} {shown}" if symbol and isinstance(value, str) else f"{symbol or name} = {shown}"
 

@@ -3,7 +3,7 @@
 import csv
 import io
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,9 +71,9 @@ def draw(found: list[runs.Run], options: dict[str, Any]) -> None:
 
     with style.styled():
         figure, axes = style.grid(len(panels), COLUMNS, (5.6, 3.6) if len(panels) == 1 else (4.4, 3.1))
-        ordered = is_ordered(together)
+        looks = style.looks_of([one.name for one in together], ordered=is_ordered(together))
         for axis, y, curves in zip(axes, options["y"], panels, strict=True):
-            draw_curves(axis, curves, ordered=ordered)
+            draw_curves(axis, curves, looks)
             axis.set_ylabel(AXES.get(y, y))
             style.steps_axis(axis, AXES[options["x"]])
             if y == "eval_return":
@@ -94,12 +94,12 @@ def is_ordered(together: Sequence[groups.Group]) -> bool:
     return all(len(value) == 1 and isinstance(value[0], int | float) for value in values)
 
 
-def draw_curves(axis: Any, curves: Sequence[Curve], *, ordered: bool = False) -> None:
-    """A line with its band for each."""
+def draw_curves(axis: Any, curves: Iterable[Curve], looks: Mapping[str, Any]) -> None:
+    """A line with its band for each; `looks` by their names."""
     from vecpsmbpo.look import style  # here, not above: mistakes answer before matplotlib is imported
 
-    for look, line in zip(style.looks(len(curves), ordered=ordered), curves, strict=True):
-        style.line(axis, look, line.x, line.y, low=line.low, high=line.high, label=line.name)
+    for line in curves:
+        style.line(axis, looks[line.name], line.x, line.y, low=line.low, high=line.high, label=line.name)
 
 
 def draw_references(axis: Any, references: Mapping[str, Any]) -> None:

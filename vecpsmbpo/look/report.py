@@ -129,7 +129,8 @@ def _curves_picture(page: "Page", together: Sequence[groups.Group], y: str) -> s
     if not any(len(line.x) for line in curves):
         return ""
     figure, (axes,) = style.grid(1, 1)
-    plot.draw_curves(axes, curves, ordered=plot.is_ordered(together))
+    looks = style.looks_of([line.name for line in curves], ordered=plot.is_ordered(together))
+    plot.draw_curves(axes, curves, looks)
     style.steps_axis(axes, AXES["env_steps"])
     axes.set_ylabel(AXES[y])
     style.legend(figure, axes, columns=2)

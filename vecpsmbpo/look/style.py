@@ -82,6 +82,11 @@ def looks(count: int, *, ordered: bool = False) -> list[Look]:
     ]
 
 
+def looks_of(names: Sequence[str], *, ordered: bool = False) -> dict[str, Look]:
+    """How each of the named series is drawn, in every panel."""
+    return dict(zip(names, looks(len(names), ordered=ordered), strict=True))
+
+
 @contextlib.contextmanager
 def styled() -> Iterator[None]:
     """In it figures are made and saved."""
