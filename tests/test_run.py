@@ -1,5 +1,6 @@
 """Whole runs through the command line: every task and driver, and several at once."""
 
+import importlib.util
 import math
 from importlib import resources
 
@@ -54,8 +55,9 @@ def test_every_experiment_runs(experiment, tmp_path):
     assert len(runs) == expected * 2 ** len(fewer)
     for run in runs:
         check_log(run, config.load(run))
-    drawn = command("figure", experiment, "size=tiny", cwd=tmp_path)
-    assert drawn.returncode == 0, drawn.stderr
+    if experiment not in ("fig8", "fig18", "fig19") or importlib.util.find_spec("umap"):
+        drawn = command("figure", experiment, "size=tiny", cwd=tmp_path)
+        assert drawn.returncode == 0, drawn.stderr
 
 
 def _swept(experiment: str, name: str) -> list[str]:
