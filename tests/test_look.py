@@ -151,6 +151,13 @@ def test_the_probability_of_improvement_is_mann_whitney_s(tmp_path):
     assert statistics.probability_of_improvement([one], [other]) == pytest.approx(expected)
 
 
+def test_what_is_not_known_is_not_trimmed_away():
+    scores = [np.array([1.0, 2.0, np.nan, 3.0])]
+    assert np.isnan(statistics.interquartile_mean(scores))
+    assert np.isnan(statistics.optimality_gap(scores))
+    assert np.isnan(statistics.probability_of_improvement(scores, [np.zeros(2)]))
+
+
 def test_the_bootstrap_s_interval_is_that_of_a_normal_mean():
     sample = np.random.default_rng(1).normal(5, 2, 400)
     estimate = statistics.bootstrap(statistics.mean, [sample], resamples=4000)
@@ -454,6 +461,19 @@ def test_every_algorithm_has_a_report(algo, tmp_path):
     path = looks.write(tmp_path / "a", looks.epochs([1, 2, 3]), looks.episodes(5, (1, 1)), algo=algo)
     _report(path, f"out={tmp_path / 'a.html'}")
     assert ("Who acted" in (tmp_path / "a.html").read_text()) is False  # one member: nothing is drawn
+
+
+def test_a_frozen_lane_has_a_report(tmp_path):
+    """Its last line has numbers no more."""
+    frozen = looks.epochs([5, 6], seed=1)
+    frozen.append(dict.fromkeys(frozen[0]) | {"env_steps": 120, "seed": 1, "frozen": True})
+    path = looks.write(tmp_path / "a", looks.epochs([1, 2, 3]) + frozen, looks.episodes(5), num_seeds=2)
+    _report(path, f"out={tmp_path / 'a.html'}")
+    said = " ".join(_read(tmp_path / "a.html").texts)
+    assert "frozen: seed 1" in said
+    assert "nan" not in said.lower()
+    rows = compare.table(runs.load_all([path]), _options(window=1))
+    assert (rows[0].env_steps, rows[0].cells["final"].value, rows[0].cells["seconds"].value) == (120, 4.5, 5)
 
 
 def test_a_run_that_goes_on_is_looked_at_again(tmp_path):

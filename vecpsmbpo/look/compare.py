@@ -152,8 +152,14 @@ def score(lane: Lane, steps: int, options: dict[str, Any]) -> Seed:
         at, values = np.append(at, missing), np.append(values, np.full(len(missing), values[-1]))
     threshold = options["threshold"]
     reached = NAN if threshold is None else next((x for x, y in zip(at, values, strict=True) if y >= threshold), np.inf)
-    seconds = lane.epochs["seconds"][lane.epochs["env_steps"] <= steps][-1] if "seconds" in lane.epochs else NAN
-    return Seed(float(values[-options["window"] :].mean()), float(values.max()), float(values.mean()), reached, seconds)
+    seconds = lane.epochs.get("seconds", np.empty(0))[: np.sum(lane.epochs["env_steps"] <= steps)]
+    return Seed(
+        final=float(values[-options["window"] :].mean()),
+        best=float(values.max()),
+        area=float(values.mean()),
+        reached=float(reached),
+        seconds=float(np.nanmax(seconds, initial=0.0)),
+    )
 
 
 def _scale(lane: Lane, options: dict[str, Any]) -> tuple[float, float] | None:
@@ -224,27 +230,28 @@ def _normalised(scores: dict[str, list[Seed]], scales: dict) -> list[np.ndarray]
 
 # ── as text, Markdown and CSV ─────────────────────────────────────────────────────────────────────────────────────
 
+FRACTIONS = ("optimality gap", "P(better)")
 CELLS = ("final", "best", "area", "steps to", "optimality gap", "P(better)", "seconds")
 
 
-def _shown(rows: Sequence[Row]) -> list[str]:
+def _columns(rows: Sequence[Row]) -> list[str]:
     """The columns in which any row has a number."""
     return [name for name in CELLS if any(not np.isnan(row.cells.get(name, UNKNOWN).value) for row in rows)]
 
 
-def _cell(name: str, cell: Estimate | None) -> str:
-    """`412 [380, 455]`; a dash for what is not known."""
-    if cell is None or np.isnan(cell.value):
+def shown(cell: Estimate, *, fraction: bool = False) -> str:
+    """`412 [380, 455]`; two digits after the point for fractions and below ten; a dash for what is not known."""
+    if np.isnan(cell.value):
         return "–"
     if np.isinf(cell.value):
         return "not reached"
-    digits = (lambda x: f"{x:.2f}") if name in ("optimality gap", "P(better)") or abs(cell.value) < 10 else _whole
-    interval = "" if np.isnan(cell.low) else f" [{digits(cell.low)}, {digits(cell.high)}]"
-    return digits(cell.value) + interval
+    digits = ",.2f" if fraction or abs(cell.value) < 10 else ",.0f"
+    interval = "" if np.isnan(cell.low) else f" [{cell.low:{digits}}, {cell.high:{digits}}]"
+    return f"{cell.value:{digits}}{interval}"
 
 
-def _whole(value: float) -> str:
-    return f"{value:,.0f}"
+def _cell(row: Row, name: str) -> str:
+    return shown(row.cells.get(name, UNKNOWN), fraction=name in FRACTIONS)
 
 
 def _seeds(row: Row) -> str:
@@ -294,9 +301,9 @@ def cells(rows: Sequence[Row]) -> Iterator[tuple[list[str], list[list[str]]]]:
     """Head and lines of a table for each task, as text."""
     for title, part in itertools.groupby(rows, _title):
         lines = list(part)
-        shown = _shown(lines)
-        body = [[row.name, _seeds(row), *(_cell(name, row.cells.get(name)) for name in shown)] for row in lines]
-        yield [title, "seeds", *shown], body
+        names = _columns(lines)
+        body = [[row.name, _seeds(row), *(_cell(row, name) for name in names)] for row in lines]
+        yield [title, "seeds", *names], body
 
 
 def as_markdown(rows: Sequence[Row], options: dict[str, Any]) -> str:
@@ -310,12 +317,12 @@ def as_markdown(rows: Sequence[Row], options: dict[str, Any]) -> str:
 
 def as_csv(rows: Sequence[Row], options: dict[str, Any]) -> str:
     """Each number with the ends of its interval in columns of their own."""
-    shown, text = _shown(rows), io.StringIO()
+    names, text = _columns(rows), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    fields = [field for name in shown for field in (name, f"{name} low", f"{name} high")]
+    fields = [field for name in names for field in (name, f"{name} low", f"{name} high")]
     writer.writerow(["task", "group", "seeds", "frozen", "env_steps", *fields])
     for row in rows:
-        numbers = [number for name in shown for number in row.cells.get(name, UNKNOWN)]
+        numbers = [number for name in names for number in row.cells.get(name, UNKNOWN)]
         seeds = sum(map(len, row.scores.values()))
         cells = ["" if np.isnan(number) else f"{number:.5g}" for number in numbers]
         writer.writerow([row.task, row.name, seeds, row.frozen, row.env_steps, *cells])

@@ -3,6 +3,7 @@
 import functools
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,26 +49,32 @@ def run(words: Sequence[str]) -> int:
         raise SettingError(f"figure: {what}; one of {', '.join(DRAW)}")
     (name,) = named
     experiment = experiments.load(name, values["runs"], values["size"])
-    out = values["out"] or (None if name == "table1" else arguments.out(f"{name}.png", ".png").default)
+    out = values["out"] or (None if name == "table1" else Path(f"{name}.png"))
     if out is not None:
         files.check_writable(out)
+    if DRAW[name] is draw_states:
+        states.check_umap()
     for text in experiment.warnings():
         print(f"vecpsmbpo: warning: {text}", file=sys.stderr)
-    if name == "table1":
-        text = table_1(experiment)
-        if out is None:
-            print(text, end="")
-            return 0
-        files.write_text(out, text)
-    else:
-        if DRAW[name] is draw_states:
-            states.check_umap()
-        from vecpsmbpo.look import style
-
-        with style.styled():
-            style.save(DRAW[name](experiment), out)
-    print(f"written: {out}")
+    _write(experiment, out)
     return 0
+
+
+def _write(experiment: Experiment, out: Path | None) -> None:
+    """Draws the figure into `out`; the table may also be printed (None)."""
+    drawn = DRAW[experiment.name]
+    if drawn is table_1:
+        if out is None:
+            print(table_1(experiment), end="")
+            return
+        files.write_text(out, table_1(experiment))
+    else:
+        from vecpsmbpo.look import style  # here, not above: mistakes answer before matplotlib is imported
+
+        assert out is not None, "only the table is printed"
+        with style.styled():
+            style.save(drawn(experiment), out)
+    print(f"written: {out}")
 
 
 Panel = tuple["Axes", str, list[Group]]  # with its task, and what is drawn of it
@@ -265,10 +272,10 @@ def draw_states(experiment: Experiment) -> "Figure":
                 axis = axes[row * columns + index * STAGES + stage]
                 begin, end = last * stage // STAGES, last * (stage + 1) // STAGES
                 here = place[(one.steps >= begin) & (one.steps < end)]
-                axis.scatter(*everywhere.T, s=1, color=style.GRID, lw=0, rasterized=True)
-                axis.scatter(*here.T, s=2, color=look.colour, lw=0, rasterized=True)
+                axis.scatter(everywhere[:, 0], everywhere[:, 1], s=1, color=style.GRID, lw=0, rasterized=True)
+                axis.scatter(here[:, 0], here[:, 1], s=2, color=look.colour, lw=0, rasterized=True)
                 name = groups.display("algo", one.run.settings.algo)
-                axis.set_title(f"{name}, {begin // 1000}k–{end / 1000:.3g}k", fontsize=8, fontweight="normal")
+                axis.set_title(f"{name}, steps {begin:,} to {end:,}", fontsize=8, fontweight="normal")
                 axis.set_xticks([])
                 axis.set_yticks([])
         axes[row * columns].set_ylabel(task)

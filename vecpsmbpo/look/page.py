@@ -40,7 +40,7 @@ figure { margin: 0; padding: 10px 12px; min-width: 0; }
 figure svg { width: 100%; height: auto; display: block; }
 figure video, figure img { width: 100%; border-radius: 4px; display: block; }
 figcaption { font-size: .85rem; color: var(--soft); margin-top: 4px; }
-.wide { overflow-x: auto; }
+.wide { overflow-x: auto; margin: 12px 0; }
 table { border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabular-nums; background: var(--card); }
 th, td { padding: 4px 12px 4px 0; text-align: right; border-bottom: 1px solid var(--edge); white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; padding-left: 10px; }

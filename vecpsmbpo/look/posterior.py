@@ -5,6 +5,7 @@ read as well where there are many.
 """
 
 import itertools
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -69,11 +70,12 @@ def draw_weights(axes: Axes, lane: Lane, x: str = "episode", until: float = np.i
     before = np.concatenate([[0.0], episodes[x]])  # an episode reaches from the end of the one before it to its own
     ends, probs = before[between], binned(episodes["probs"], between)
     rows = np.arange(probs.shape[1] + 1) - 0.5
-    mesh = axes.pcolormesh(ends, rows, probs.T, cmap=SHADES, vmin=0, vmax=max(probs.max(), 1e-9), rasterized=True)
+    strongest = max(float(probs.max()), 2 / probs.shape[1])  # so that nothing but equal chances is half as strong
+    mesh = axes.pcolormesh(ends, rows, probs.T, cmap=SHADES, vmin=0, vmax=strongest, rasterized=True)
     title = "probability to act"
     if len(acts) == len(probs):
         centres = (ends[:-1] + ends[1:]) / 2
-        look = {"color": style.COLOURS[1], "lw": 0.6, "edgecolors": style.PAPER, "zorder": 3}
+        look: dict[str, Any] = {"color": style.COLOURS[1], "lw": 0.6, "edgecolors": style.PAPER, "zorder": 3}
         axes.scatter(centres[acts >= 0], acts[acts >= 0], s=np.clip(3000 / len(acts), 8, 26), **look)
         title = "probability to act, and who did (dots)"
     axes.set_title(title, fontweight="normal", fontsize=9)
@@ -83,7 +85,7 @@ def draw_weights(axes: Axes, lane: Lane, x: str = "episode", until: float = np.i
     shown = range(0, len(labels), -(-len(labels) // 12))
     axes.set_yticks(list(shown), [labels[index] for index in shown])
     axes.set_ylabel("member n, m" if "," in labels[0] else "member m")
-    bar = axes.get_figure().colorbar(mesh, ax=axes, pad=0.02, fraction=0.05)
+    bar = axes.figure.colorbar(mesh, ax=axes, pad=0.02, fraction=0.05)
     bar.outline.set_visible(False)
     bar.ax.yaxis.set_major_locator(MaxNLocator(4))
 
@@ -94,7 +96,7 @@ def _draw_returns(axes: Axes, episodes: Columns, acts: Array) -> None:
     if len(index) > 4 * BINS:
         _draw_spread(axes, index, earned)
     else:
-        alone = {"facecolors": "none", "edgecolors": style.FAINT, "lw": 0.7}
+        alone: dict[str, Any] = {"facecolors": "none", "edgecolors": style.FAINT, "lw": 0.7}
         axes.scatter(index[~credited], earned[~credited], s=14, label="random, or by all", **alone)
         axes.scatter(index[credited], earned[credited], s=14, label="by a member", color=style.COLOURS[1], lw=0)
     axes.set_xlabel("episode")

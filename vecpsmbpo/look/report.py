@@ -192,15 +192,22 @@ def _tiles(run: Run) -> list[tuple[str, str]]:
     """The numbers to see first."""
     last = [compare.score(lane, run.env_steps, _scoring()) for lane in run.lanes]
     final = statistics.bootstrap(statistics.interquartile_mean, [np.array([seed.final for seed in last])])
-    spread = "" if np.isnan(final.low) else f" [{final.low:,.0f}, {final.high:,.0f}]"
-    seconds = max(lane.epochs["seconds"][-1] for lane in run.lanes if "seconds" in lane.epochs)
-    speed = run.lanes[0].epochs.get("updates_per_s", np.zeros(1))[-1]
-    return [
-        (f"{final.value:,.0f}{spread}", f"evaluation return, last {WINDOW} epochs"),
-        (f"{np.nanmax([seed.best for seed in last]):,.0f}", "best evaluation"),
-        (_duration(seconds), "wall time"),
-        (f"{speed:,.0f}", "SAC updates per second"),
+    best = statistics.Estimate(max(seed.best for seed in last), np.nan, np.nan)
+    tiles = [
+        (compare.shown(final), f"evaluation return, last {WINDOW} epochs"),
+        (compare.shown(best), "best evaluation"),
     ]
+    if seconds := _known(run, "seconds"):
+        tiles.append((_duration(seconds[-1]), "wall time"))
+    if speeds := _known(run, "updates_per_s"):
+        tiles.append((f"{speeds[-1]:,.0f}", "SAC updates per second"))
+    return tiles
+
+
+def _known(run: Run, name: str) -> list[float]:
+    """What the log has of a column, by time; a frozen lane's last line has nothing."""
+    column = run.metrics.columns.get(name, np.empty(0))
+    return column[np.isfinite(column)].tolist()
 
 
 def _scoring() -> dict[str, Any]:

@@ -50,7 +50,7 @@ def probability_of_improvement(scores: Scores, others: Scores) -> float:
 
 def _wins(one: Array, other: Array) -> float:
     differences = one[:, None] - other[None, :]
-    return float(np.mean((differences > 0) + 0.5 * (differences == 0)))
+    return float(np.mean(np.where(np.isnan(differences), np.nan, (differences > 0) + 0.5 * (differences == 0))))
 
 
 def bootstrap(statistic: Callable[..., float], *samples: Scores, seed: int = 0, resamples: int = RESAMPLES) -> Estimate:
@@ -73,10 +73,12 @@ def bootstrap(statistic: Callable[..., float], *samples: Scores, seed: int = 0, 
 
 
 def trimmed_mean(values: Array, axis: int = 0) -> Array:
-    """As `interquartile_mean`, along an axis of an array."""
+    """As `interquartile_mean`, along an axis; NaN where any value is (sorting would hide it at an end)."""
+    unknown = np.isnan(values).any(axis=axis)
     values = np.sort(values, axis=axis)
     cut = values.shape[axis] // 4
-    return np.take(values, range(cut, values.shape[axis] - cut), axis=axis).mean(axis=axis)
+    middle = np.take(values, range(cut, values.shape[axis] - cut), axis=axis)
+    return np.where(unknown, np.nan, middle.mean(axis=axis))
 
 
 def band(curves: Array, average: Callable[..., Array], seed: int = 0) -> tuple[Array, Array]:
