@@ -166,7 +166,7 @@ def shelf(tmp_path, monkeypatch):
             ["fig9", "size=paper"],
             "fig9: there are no runs in runs/fig9; to make them: vecpsmbpo train -m experiment=fig9",
         ),
-        (["fig9", "size=big"], "size=big: must be one of"),
+        (["fig9", "size=big"], "size=big: must be one of cpu, paper, tiny"),
         (["fig9", "size=cpu", "out=a.csv"], "out=a.csv: must be a file that ends in .png, .svg, .pdf"),
         (["fig8"], "figure: this one needs umap-learn; pip install 'vecpsmbpo[umap]'"),
     ],

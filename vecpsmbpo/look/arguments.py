@@ -30,9 +30,13 @@ def names(*default: str, allowed: str = "names, separated by commas") -> Option:
     return Option(default, lambda value: tuple(_filled(part) for part in value.split(",")), allowed)
 
 
-def choice(*options: str) -> Option:
-    """One of `options`; the first is the default."""
-    return Option(options[0], lambda value: options[options.index(value)], "one of " + ", ".join(options))
+def choice(*options: str, default: str | None = None) -> Option:
+    """One of `options`; the first is the default, unless another is given."""
+    return Option(
+        options[0] if default is None else default,
+        lambda value: options[options.index(value)],
+        "one of " + ", ".join(options),
+    )
 
 
 def whole(default: int, at_least: int = 0) -> Option:

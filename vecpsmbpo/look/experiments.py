@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from vecpsmbpo import config
-from vecpsmbpo.look import arguments, groups, runs
+from vecpsmbpo.look import groups, runs
 from vecpsmbpo.look.groups import Group
 from vecpsmbpo.look.runs import Run
 from vecpsmbpo.settings import SettingError, Settings
@@ -85,9 +85,3 @@ def _grid(name: str) -> dict[str, list[Any]]:
 
 def _is_at(settings: Settings, point: dict[str, Any]) -> bool:
     return all(getattr(settings, name) == value for name, value in point.items())
-
-
-OPTIONS = {
-    "size": arguments.choice("", *config.options("size")),
-    "runs": arguments.out("runs"),
-}

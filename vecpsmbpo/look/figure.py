@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from vecpsmbpo import config
 from vecpsmbpo.look import arguments, compare, experiments, files, groups, published, states
 from vecpsmbpo.look.curves import AXES, Curve, curve, error_band, joined
 from vecpsmbpo.look.experiments import Experiment
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
+OPTIONS = {"size": arguments.choice(*config.options("size"), default=""), "runs": arguments.out("runs")}
 LAST = 10  # evaluations that figure 7 averages
 STAGES = 3  # of training, in figures 8, 18 and 19
 INITIAL = 1 / 3  # of training, which figures 9 and 10 show by itself (40K of 125K steps, 100K of 300K)
@@ -42,8 +44,7 @@ def run(words: Sequence[str]) -> int:
         SettingError: a mistake in `words`, there are no runs, or the file cannot be written.
     """
     suffixes = (".md", ".txt") if "table1" in words else (".png", ".svg", ".pdf")
-    options = experiments.OPTIONS | {"out": arguments.out("", *suffixes)}
-    named, values = arguments.parse("figure", words, options)
+    named, values = arguments.parse("figure", words, OPTIONS | {"out": arguments.out("", *suffixes)})
     if len(named) != 1 or named[0] not in DRAW:
         what = f"{named[0]} is a drawing and is left out" if named and named[0] in DRAWINGS else "takes the name of one"
         raise SettingError(f"figure: {what}; one of {', '.join(DRAW)}")

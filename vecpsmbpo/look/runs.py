@@ -186,8 +186,9 @@ def _dictionary(line: bytes, needed: tuple[str, ...]) -> dict[str, Any] | None:
 
 
 def _has(line: Any, needed: tuple[str, ...]) -> bool:
+    """Whether a line is a dictionary with these numbers."""
     return isinstance(line, dict) and all(
-        type(line.get(name)) in (int, float) or line.get(name) == "inf" for name in needed
+        type(line.get(name)) in (int, float) or line.get(name) == INFINITY for name in needed
     )
 
 

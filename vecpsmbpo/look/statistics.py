@@ -30,11 +30,6 @@ def interquartile_mean(scores: Scores) -> float:
     return float(trimmed_mean(np.concatenate([np.ravel(task) for task in scores])))
 
 
-def mean(scores: Scores) -> float:
-    """The mean over tasks of their means over runs."""
-    return float(np.mean([np.mean(task) for task in scores]))
-
-
 def optimality_gap(scores: Scores) -> float:
     """By how much scores fall short of 1, on average; what lies above 1 does not make up for what lies below."""
     return float(1 - np.concatenate([np.minimum(task, 1.0) for task in scores]).mean())

@@ -23,7 +23,6 @@ Array = np.ndarray
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5c00", "#444444")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 INK, FAINT, GRID, PAPER = "#1f2328", "#656d76", "#d8dee4", "#ffffff"
-SUFFIXES = (".png", ".svg", ".pdf")
 MARKS = 8  # markers of a line
 
 RC: Any = {
