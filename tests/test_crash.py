@@ -76,7 +76,9 @@ def test_nothing_is_said_of_any_other_end(end, status, tmp_path):
 
 def test_the_watcher_outlives_the_signals_that_end_the_process(tmp_path):
     """Control-C goes to both: the process ends as it likes, and the watcher after it."""
-    program = PROGRAM.format(end="print('ready', flush=True); signal.pause()")
+    # A shell that starts something in the background has it ignore Control-C, and so would this process.
+    heeding = "signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program = PROGRAM.format(end=f"{heeding}; print('ready', flush=True); signal.pause()")
     process = subprocess.Popen(
         [sys.executable, "-c", program],
         cwd=tmp_path,

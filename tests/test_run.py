@@ -1,5 +1,6 @@
 """Whole runs through the command line: every task and driver, and several at once."""
 
+import importlib.util
 import math
 from importlib import resources
 
@@ -48,7 +49,7 @@ def test_every_task_runs_end_to_end_and_resumes_on_every_backend(name, backend, 
 @pytest.mark.slow
 @pytest.mark.parametrize("experiment", config.options("experiment"))
 def test_every_experiment_runs(experiment, tmp_path):
-    """All that it compares, on the task of it that compiles fastest and with few models and policies."""
+    """And is drawn: all that it compares, on the task of it that compiles fastest and with few models and policies."""
     tasks, quick = _swept(experiment, "env"), ("ball_in_cup", "cartpole_swingup_sparse", "window_open", "hopper")
     narrowed = [f"env={next(task for task in quick if task in tasks)}"]
     fewer = [f"{name}=1,2" for name in ("n_models", "n_policies") if len(_swept(experiment, name)) > 2]
@@ -60,6 +61,9 @@ def test_every_experiment_runs(experiment, tmp_path):
     assert len(runs) == expected * 2 ** len(fewer)
     for run in runs:
         check_log(run, config.load(run))
+    if experiment not in ("fig8", "fig18", "fig19") or importlib.util.find_spec("umap"):
+        drawn = command("figure", experiment, "size=tiny", cwd=tmp_path)
+        assert drawn.returncode == 0, drawn.stderr
 
 
 def _swept(experiment: str, name: str) -> list[str]:

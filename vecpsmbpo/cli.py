@@ -1,5 +1,6 @@
 """The command line. Imports JAX only once every argument has been understood."""
 
+import importlib
 import os
 import sys
 from collections.abc import Sequence
@@ -16,6 +17,12 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo train env=hopper sweep.real_ratio=[0,0.05]      every value at once, in one program
   vecpsmbpo train -m experiment=fig2 size=cpu       the runs behind a figure of the paper
   vecpsmbpo eval run_dir=runs/x episodes=10         evaluate it
+  vecpsmbpo plot runs/x runs/y out=curves.png       learning curves, grouped by what differs
+  vecpsmbpo compare runs/x runs/y                   the same as a table, with intervals
+  vecpsmbpo report runs/x out=report.html           all a run has to show, on one page
+  vecpsmbpo render runs/x out=walk.mp4              its best member at work; member=all: all of them
+  vecpsmbpo export runs/x out=policy/               its best policy as files that need nothing of this
+  vecpsmbpo figure fig9 size=cpu out=fig9.png       a figure of the paper, from the runs of its experiment
   vecpsmbpo envs                                    tasks, backends, sizes
   vecpsmbpo theory                                  the paper's theory in numbers, in seconds
   vecpsmbpo --version                               of this program, jax, mujoco and Python
@@ -25,6 +32,10 @@ settings: {settings}
 
 What each setting does stands beside its default in {config}.
 """
+
+
+# Commands that read runs and show them: modules of `vecpsmbpo.look`.
+LOOKS = ("plot", "compare", "report", "figure", "render", "export")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -62,12 +73,14 @@ def _dispatch(arguments: list[str]) -> int:
         from vecpsmbpo.theory import report
 
         return report.run(rest)
+    if command in LOOKS:
+        return importlib.import_module(f"vecpsmbpo.look.{command}").run(rest)
     if command == "train":
         multirun = {"-m", "--multirun"} & set(rest)
         overrides = [text for text in rest if text not in ("-m", "--multirun")]
         with crash.watched():
             return _multirun(overrides) if multirun else _train(overrides)
-    raise SettingError(f"{command}: no such command; one of train, eval, envs, theory")
+    raise SettingError(f"{command}: no such command; one of train, eval, envs, theory, {', '.join(LOOKS)}")
 
 
 def _train(overrides: list[str]) -> int:

@@ -198,7 +198,7 @@ def load(run_dir: str | Path) -> Settings:
     except OSError:
         raise SettingError(f"run_dir={run_dir}: holds no {CONFIG_FILE}, so no run") from None
     except (KeyError, TypeError, yaml.YAMLError) as error:
-        raise SettingError(f"run_dir={run_dir}: its {CONFIG_FILE} cannot be read ({error})") from None
+        raise SettingError(f"run_dir={run_dir}: its {CONFIG_FILE} cannot be read ({_first_line(error)})") from None
 
 
 def resolve(overrides: Sequence[str], tree: DictConfig | None = None) -> Settings:

@@ -54,6 +54,7 @@ class Settings:
     eval_policy: str = _choice("posterior", "best", "average")
     eval_actions: str = _choice("mean", "sampled")
     checkpoint_every: int = _whole(1)
+    report: bool
     devices: int = _whole(0)
     compile_cache: bool
     # real data
@@ -216,7 +217,8 @@ TRACED = (
 
 # Settings that a resumed run may change: they steer the loop around the run, not what it computes.
 CHANGEABLE = frozenset(
-    {"total_steps", "eval_episodes", "eval_policy", "eval_actions", "checkpoint_every", "devices", "compile_cache"}
+    {"total_steps", "eval_episodes", "eval_policy", "eval_actions", "checkpoint_every", "report", "devices"}
+    | {"compile_cache"}
 )
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from vecpsmbpo import algorithms, checkpoint, config, crash, envs, health, metrics, resources, runtime, versions
 from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
+from vecpsmbpo.look import report
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.types import Hyper, TrainState
@@ -216,6 +217,8 @@ class _Run:
         epoch = self.env_steps // settings.epoch_steps
         if epoch % settings.checkpoint_every == 0 and self.env_steps < settings.total_steps:
             self._save()
+        if settings.report and (epoch % settings.checkpoint_every == 0 or self.env_steps >= settings.total_steps):
+            report.keep(self.run_dir, _warn)
 
     def _lines(self, returns: Returns, seconds: float) -> list[metrics.Line]:
         settings = self.settings

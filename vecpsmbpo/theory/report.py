@@ -12,7 +12,7 @@ from rich.progress import track
 from rich.table import Table
 
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.theory import example, svg, tabular
+from vecpsmbpo.theory import example, tabular
 from vecpsmbpo.theory.tabular import Belief, Estimate
 
 Array = np.ndarray
@@ -123,7 +123,7 @@ def run(overrides: list[str]) -> int:
         console.print(_arms_table(experiment, options), "", _best_table(experiment), "", sep="\n")
         console.print(_notes(experiment, options), markup=False)
         _write_csv(folder / "theory.csv", experiment)
-        svg.write(folder / "theory.svg", "The theory of posterior sampling", _panels(experiment), columns=3)
+        _draw(folder / "theory.svg", experiment)
     except OSError as error:
         raise SettingError(f"out={options.out}: cannot be written ({error.strerror})") from None
     console.print(f"written: {folder / 'theory.csv'}, {folder / 'theory.svg'}", markup=False)
@@ -267,37 +267,41 @@ def _notes(experiment: Experiment, options: Options) -> str:
     return "\n".join(lines)
 
 
-def _panels(experiment: Experiment) -> list[svg.Panel]:
+def _draw(path: Path, experiment: Experiment) -> None:
+    """Writes the figure."""
+    from vecpsmbpo.look.lines import Panel, Series, write  # here, not above: mistakes answer before matplotlib is there
+
     names = list(experiment.arms)
     episode = np.arange(1, len(experiment.exact.regret) + 1)
     ratios = np.array(REAL_RATIOS)
 
-    def over_episodes(name: str, arm: Arm) -> svg.Series:
-        return svg.Series(name, episode, arm.regret, arm.error)
+    def over_episodes(name: str, arm: Arm) -> Series:
+        return Series(name, episode, arm.regret, arm.error)
 
     wide = tabular.WRONG[0].name
     degenerate = [over_episodes(f"{name}, λ = 0", experiment.arms[name][0]) for name in names]
     degenerate.append(over_episodes("no model, λ = 1", experiment.arms[wide][-1]))
     sweeps = [
-        svg.Series(name, ratios, np.array([arm.regret[-1] for arm in arms]), np.array([arm.error[-1] for arm in arms]))
+        Series(name, ratios, np.array([arm.regret[-1] for arm in arms]), np.array([arm.error[-1] for arm in arms]))
         for name, arms in experiment.arms.items()
     ]
     seconds = [[arm.second_term for arm in arms] for arms in experiment.arms.values()]
     terms = [
-        svg.Series(name, ratios, np.array([term.value for term in row]), np.array([term.error for term in row]))
+        Series(name, ratios, np.array([term.value for term in row]), np.array([term.error for term in row]))
         for name, row in zip(names, seconds, strict=True)
     ]
-    cases = [svg.Series(case.name, CURVE, _example_curve(case, CURVE)) for case in example.LAMBDA_CASES]
-    curves = [svg.Series(name, CURVE, curve) for name, curve in experiment.curves.items()]
+    cases = [Series(case.name, CURVE, _example_curve(case, CURVE)) for case in example.LAMBDA_CASES]
+    curves = [Series(name, CURVE, curve) for name, curve in experiment.curves.items()]
     mixed = [over_episodes(f"λ = {arm.real_ratio:g}", arm) for arm in experiment.arms[wide]]
-    return [
-        svg.Panel("Proposition 2 in Example 1", "λ", "KL(q | p)", cases),
-        svg.Panel("Proposition 2, tabular, same data", "λ", "KL(q | p)", curves),
-        svg.Panel("Regret of the degenerate posterior", "episode", "regret", degenerate),
-        svg.Panel("Regret at the end", "λ", "regret", sweeps),
-        svg.Panel("Theorem 1's second term", "λ", "2 H R_max Σ √E[KL]", terms),
-        svg.Panel(f"Regret where q(M|D) is {wide}", "episode", "regret", mixed),
+    panels = [
+        Panel("Proposition 2 in Example 1", "λ", "KL(q | p)", cases),
+        Panel("Proposition 2, tabular, same data", "λ", "KL(q | p)", curves),
+        Panel("Regret of the degenerate posterior", "episode", "regret", degenerate),
+        Panel("Regret at the end", "λ", "regret", sweeps),
+        Panel("Theorem 1's second term", "λ", "2 H R_max Σ √E[KL]", terms),
+        Panel(f"Regret where q(M|D) is {wide}", "episode", "regret", mixed),
     ]
+    write(path, "The theory of posterior sampling", panels, columns=3)
 
 
 def _write_csv(path: Path, experiment: Experiment) -> None:

@@ -1,0 +1,124 @@
+"""What the commands of this package may be told: run directories, and `name=value` each."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from vecpsmbpo.config import CONFIG_FILE, closest
+from vecpsmbpo.settings import SettingError
+
+
+class Option(NamedTuple):
+    """A `name=value`.
+
+    Attributes:
+        default: where it is not given.
+        read: the value from its text; a ValueError says that it cannot be.
+        allowed: what the value may be, in words.
+    """
+
+    default: Any
+    read: Callable[[str], Any]
+    allowed: str
+
+
+def text(default: str = "", allowed: str = "a name") -> Option:
+    return Option(default, _filled, allowed)
+
+
+def names(*default: str, allowed: str = "names, separated by commas") -> Option:
+    return Option(default, lambda value: tuple(_filled(part) for part in value.split(",")), allowed)
+
+
+def choice(*options: str, default: str | None = None) -> Option:
+    """One of `options`; the first is the default, unless another is given."""
+    return Option(
+        options[0] if default is None else default,
+        lambda value: options[options.index(value)],
+        "one of " + ", ".join(options),
+    )
+
+
+def whole(default: int, at_least: int = 0) -> Option:
+    def read(value: str) -> int:
+        # isdecimal before int: int() also takes 1_0, " 1" and other spellings.
+        if not (value.isascii() and value.isdecimal() and int(value) >= at_least):
+            raise ValueError
+        return int(value)
+
+    return Option(default, read, f"a whole number, at least {at_least}")
+
+
+def number(default: float | None = None) -> Option:
+    def read(value: str) -> float:
+        found = float(value)
+        if found != found or abs(found) == float("inf"):
+            raise ValueError
+        return found
+
+    return Option(default, read, "a number")
+
+
+def out(default: str, *suffixes: str) -> Option:
+    """A file to write, of one of the kinds that `suffixes` name; without any, a directory."""
+
+    def read(value: str) -> Path:
+        path = Path(_filled(value))
+        if suffixes and path.suffix.lower() not in suffixes:
+            raise ValueError
+        return path
+
+    kinds = f"a file that ends in {', '.join(suffixes)}" if suffixes else "a directory"
+    return Option(Path(default) if default else None, read, kinds)
+
+
+def _filled(value: str) -> str:
+    if not value:
+        raise ValueError
+    return value
+
+
+def parse(command: str, words: Sequence[str], options: Mapping[str, Option]) -> tuple[list[str], dict[str, Any]]:
+    """Splits a command line into what stands by itself and the value of every option.
+
+    `run_dir=x` is the same as `x`.
+
+    Raises:
+        SettingError: an option that there is not, or a value that it cannot have.
+    """
+    alone: list[str] = []
+    values = {name: option.default for name, option in options.items()}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals:
+            alone.append(word)
+        elif name == "run_dir":
+            alone.append(value)
+        elif name not in options:
+            raise SettingError(f"{word}: no such option of {command}; {closest(name, options)}")
+        else:
+            try:
+                values[name] = options[name].read(value)
+            except ValueError:
+                raise SettingError(f"{word}: must be {options[name].allowed}") from None
+    return alone, values
+
+
+def run_dirs(command: str, words: Sequence[str], *, most: int | None = None) -> list[Path]:
+    """The run directories that `words` name: each is one, or holds some.
+
+    Raises:
+        SettingError: none is named, one holds no run, or there are more than `most`.
+    """
+    if not words:
+        raise SettingError(f"run_dir: {command} needs the directory of a run that train has written")
+    found: list[Path] = []
+    for word in words:
+        path = Path(word)
+        here = [path] if (path / CONFIG_FILE).exists() else sorted(p.parent for p in path.glob(f"*/{CONFIG_FILE}"))
+        if not here:
+            raise SettingError(f"run_dir={word}: holds no {CONFIG_FILE}, so no run")
+        found += [run for run in here if run not in found]
+    if most is not None and len(found) > most:
+        raise SettingError(f"run_dir: {command} takes {most} run, not {len(found)}")
+    return found

@@ -1,0 +1,47 @@
+"""Files that are whole or not there."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from vecpsmbpo.settings import SettingError
+
+
+def write(path: Path, make: Callable[[Path], object]) -> None:
+    """Has `make` write a file beside `path`, of the same kind, and moves it there.
+
+    Raises:
+        SettingError: it cannot be written; what stood at `path` is as it was.
+    """
+    beside = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        make(beside)
+        beside.replace(path)
+    except OSError as error:
+        raise SettingError(f"out={path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """As `write`, of a text."""
+    write(path, lambda beside: beside.write_text(text, encoding="utf-8"))
+
+
+def check_writable(path: Path) -> None:
+    """Says before long work, rather than after it, that its file could not be written.
+
+    Raises:
+        SettingError: `path` is a directory, or the nearest directory above it that exists cannot be written.
+    """
+    above = next(parent for parent in path.absolute().parents if parent.exists())
+    if path.is_dir():
+        reason = "Is a directory"
+    elif not above.is_dir():
+        reason = "Not a directory"
+    elif not os.access(above, os.W_OK | os.X_OK):
+        reason = "Permission denied"
+    else:
+        return
+    raise SettingError(f"out={path}: cannot be written ({reason})")

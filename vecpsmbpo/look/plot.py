@@ -1,0 +1,137 @@
+"""`vecpsmbpo plot`: learning curves of runs beside each other."""
+
+import csv
+import io
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from vecpsmbpo.look import arguments, files, groups, published, runs
+from vecpsmbpo.look.curves import AVERAGES, AXES, Curve, check_columns, curve
+from vecpsmbpo.settings import SettingError
+
+OPTIONS = {
+    "x": arguments.choice("env_steps", "seconds"),
+    "y": arguments.names("eval_return"),
+    "group": arguments.names(),
+    "average": arguments.choice(*AVERAGES),
+    "smooth": arguments.whole(1, at_least=1),
+    "reference": arguments.names(allowed=f"of {', '.join(published.REFERENCES)}, separated by commas"),
+    "title": arguments.text(),
+    "out": arguments.out("curves.png", ".png", ".svg", ".pdf", ".csv"),
+}
+COLUMNS = 3  # panels in a row
+
+
+def run(words: Sequence[str]) -> int:
+    """The command; its exit status.
+
+    Raises:
+        SettingError: a mistake in `words`, in the runs, or in where the picture should go.
+    """
+    named, options = arguments.parse("plot", words, OPTIONS)
+    for name in options["reference"]:
+        if name not in published.REFERENCES:
+            raise SettingError(f"reference={name}: must be {OPTIONS['reference'].allowed}")
+    if options["reference"] and (options["x"] != "env_steps" or "eval_return" not in options["y"]):
+        raise SettingError("reference: is of y=eval_return over x=env_steps")
+    paths = arguments.run_dirs("plot", named)
+    files.check_writable(options["out"])
+    found = runs.load_all(paths)
+    draw(found, options)
+    for text in runs.warnings(found):
+        print(f"vecpsmbpo: warning: {text}", file=sys.stderr)
+    print(f"written: {options['out']}")
+    return 0
+
+
+def draw(found: list[runs.Run], options: dict[str, Any]) -> None:
+    """Writes the picture.
+
+    Raises:
+        SettingError: the runs are of different tasks or lack what is to be drawn, or the file cannot be written.
+    """
+    task = groups.common_task(found)
+    lookup = {"mbpo": published.mbpo, "sac": published.asymptote}
+    references = {name: lookup[name](task) for name in options["reference"]}
+    check_columns(found, "y", options["y"])
+    check_columns(found, "x", [options["x"]])
+    together = groups.group(found, options["group"])
+    if options["out"].suffix.lower() == ".csv":
+        return write_csv(options["out"], found, [name for name in (options["x"], *options["y"]) if name != "env_steps"])
+    panels = [
+        [curve(one, options["x"], y, average=options["average"], smooth=options["smooth"]) for one in together]
+        for y in options["y"]
+    ]
+    for y, curves in zip(options["y"], panels, strict=True):
+        if not any(len(line.x) for line in curves):
+            raise SettingError(f"y={y}: there is no step at which all seeds of a group have a value")
+    from vecpsmbpo.look import style
+
+    with style.styled():
+        figure, axes = style.grid(len(panels), COLUMNS, (5.6, 3.6) if len(panels) == 1 else (4.4, 3.1))
+        looks = style.looks_of([one.name for one in together], ordered=is_ordered(together))
+        for axis, y, curves in zip(axes, options["y"], panels, strict=True):
+            draw_curves(axis, curves, looks)
+            axis.set_ylabel(AXES.get(y, y))
+            style.steps_axis(axis, AXES[options["x"]])
+            if y == "eval_return":
+                draw_references(axis, references)
+        average = {"mean": "mean", "iqm": "interquartile mean"}[options["average"]]
+        seeds = {len(one.lanes) for one in together}
+        of = f"{min(seeds)} to {max(seeds)}" if len(seeds) > 1 else f"{max(seeds)}"
+        note = f"{average} of {of} seeds, 95% bootstrap band" if max(seeds) > 1 else "one seed"
+        figure.suptitle(options["title"] or f"{task}: {note}", x=0.01, ha="left", fontsize=10)
+        most = max(axes, key=lambda axis: len(axis.get_legend_handles_labels()[1]))
+        style.legend(figure, most)
+        style.save(figure, options["out"])
+
+
+def is_ordered(together: Sequence[groups.Group]) -> bool:
+    """Whether the groups are steps of one number, so that colours may be a scale."""
+    values = [tuple(one.values.values()) for one in together]
+    return all(len(value) == 1 and isinstance(value[0], int | float) for value in values)
+
+
+def draw_curves(axis: Any, curves: Iterable[Curve], looks: Mapping[str, Any]) -> None:
+    """A line with its band for each; `looks` by their names."""
+    from vecpsmbpo.look import style  # here, not above: mistakes answer before matplotlib is imported
+
+    for line in curves:
+        style.line(axis, looks[line.name], line.x, line.y, low=line.low, high=line.high, label=line.name)
+
+
+def draw_references(axis: Any, references: Mapping[str, Any]) -> None:
+    """Published curves (`published`), in grey: they are of other code, on other machines."""
+    grey = {"color": "#656d76", "lw": 1.3}
+    for name, found in references.items():
+        if name == "sac":
+            axis.axhline(found, ls=(0, (1, 1.5)), label="SAC at 3M steps", **grey)
+            continue
+        marks = {"marker": "o", "mfc": "white", "ms": 4, "capsize": 2}
+        axis.errorbar(
+            found.steps, found.mean, found.deviation, ls="--", label=f"{found.name} (± s.d.)", **marks, **grey
+        )
+
+
+def write_csv(path: Path, found: Sequence[runs.Run], names: Sequence[str]) -> None:
+    """The numbers behind a picture, small enough to commit: a line per run, lane and epoch.
+
+    Raises:
+        SettingError: it cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("run", "swept", "env_steps", "seed", *names))
+    for one in found:
+        for lane in one.lanes:
+            swept = " ".join(f"{name}={value:g}" for name, value in lane.values.items() if name != "seed")
+            columns = [lane.epochs[name] for name in ("env_steps", "seed", *names)]
+            writer.writerows((one.name, swept, *map(_number, row)) for row in zip(*columns, strict=True))
+    files.write_text(path, text.getvalue())
+
+
+def _number(value: float) -> str:
+    """Five digits, whole numbers whole; nothing for null."""
+    return "" if value != value else f"{value:.0f}" if value == int(value) else f"{value:.5g}"

@@ -1,0 +1,253 @@
+"""Runs as they lie on disk, also damaged ones and ones that are being written.
+
+Logs are read as columns, a batch of lines at a time: time and memory grow with the number of lines, and a million
+episodes are some arrays and not a million dictionaries.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vecpsmbpo import config
+from vecpsmbpo.settings import SettingError, Settings
+
+METRICS_FILE, EPISODES_FILE = "metrics.jsonl", "episodes.jsonl"
+INFINITY = "inf"  # in a swept value: JSON has no other
+BATCH = 20_000  # lines that are parsed at a time
+
+Array = np.ndarray
+Columns = dict[str, Array]
+
+
+@dataclass(frozen=True)
+class Log:
+    """A JSONL file.
+
+    Attributes:
+        columns: by name, [L] floats each, NaN for null; `probs`, and other lists, [L, ...] float32.
+        damaged: lines that could not be read and are left out; the last one does not count where it is merely
+            unfinished, as in a run that is being written.
+    """
+
+    columns: Columns
+    damaged: int
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One seed of a run, with one of its swept values.
+
+    Attributes:
+        run: the run it belongs to.
+        values: its seed and swept values, by name.
+        epochs: columns of metrics.jsonl, [T] each, by rising steps.
+        frozen: whether it stopped because something in it stopped being finite.
+    """
+
+    run: "Run"
+    values: dict[str, float]
+    epochs: Columns
+    frozen: bool
+
+    @property
+    def name(self) -> str:
+        """`seed 0`, or `seed 0, real_ratio 0.3`."""
+        return ", ".join(f"{name} {value:g}" for name, value in self.values.items())
+
+    @cached_property
+    def episodes(self) -> Columns:
+        """Columns of episodes.jsonl, [E] each; `probs` [E, N·M]."""
+        return _where(self.run.episodes, self.values)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run directory."""
+
+    path: Path
+    settings: Settings
+    metrics: Log
+
+    @cached_property
+    def lanes(self) -> list[Lane]:
+        """In the order of their first lines. A lane without a whole epoch is not there."""
+        return list(self._lanes())
+
+    def _lanes(self) -> Iterator[Lane]:
+        names = ["seed", *(name for name, _ in self.settings.sweep)]
+        table = np.stack([self.metrics.columns[name] for name in names], axis=1) if len(self.metrics) else np.empty(0)
+        for row in dict.fromkeys(map(tuple, table.tolist())):
+            values = dict(zip(names, row, strict=True))
+            epochs = _where(self.metrics.columns, values)
+            frozen = bool(np.nansum(epochs.get("frozen", np.zeros(1))))
+            yield Lane(self, values, _rising(epochs), frozen)
+
+    @cached_property
+    def episodes(self) -> Columns:
+        """Columns of episodes.jsonl of all lanes, [E] each; `probs` [E, N·M]."""
+        return read(self.path / EPISODES_FILE).columns
+
+    @property
+    def env_steps(self) -> int:
+        """How far it has come: the last whole epoch."""
+        return int(self.metrics.columns["env_steps"].max()) if len(self.metrics) else 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether it has come to its end, or all of its lanes are frozen."""
+        return self.env_steps >= self.settings.total_steps or (
+            bool(self.lanes) and all(lane.frozen for lane in self.lanes)
+        )
+
+    @property
+    def name(self) -> str:
+        return self.path.resolve().name
+
+
+def load(path: Path) -> Run:
+    """The run in a directory.
+
+    Raises:
+        SettingError: there is none, or it cannot be read (`config.load`).
+    """
+    settings = config.load(path)
+    try:
+        return Run(path, settings, read(path / METRICS_FILE, needed=("env_steps", *settings.lanes[0])))
+    except OSError as error:
+        raise SettingError(f"run_dir={path}: cannot be read ({error.strerror})") from None
+
+
+def load_all(paths: Iterable[Path]) -> list[Run]:
+    """The runs in directories, each with an epoch to show.
+
+    Raises:
+        SettingError: as `load`; or a run has not finished an epoch.
+    """
+    runs = [load(path) for path in paths]
+    for run in runs:
+        if not len(run.metrics):
+            raise SettingError(f"run_dir={run.path}: has no whole epoch in {METRICS_FILE} yet")
+    return runs
+
+
+def warnings(runs: Iterable[Run]) -> Iterator[str]:
+    """What a reader should know of the runs: a line each."""
+    for run in runs:
+        if run.metrics.damaged:
+            yield f"{run.path / METRICS_FILE}: {run.metrics.damaged} damaged line(s) left out"
+        for lane in run.lanes:
+            if lane.frozen:
+                yield f"{run.path}: {lane.name} was frozen at step {lane.epochs['env_steps'][-1]:.0f}"
+
+
+def read(path: Path, needed: Iterable[str] = ("env_steps", "seed")) -> Log:
+    """A JSONL file as columns; empty where there is no file. Lines without the `needed` numbers count as damaged."""
+    if not path.exists():
+        return Log({}, 0)
+    needed, damaged = tuple(needed), 0
+    parts: list[Columns] = []
+    with path.open("rb") as file:
+        while batch := list(islice(file, BATCH)):
+            lines, lost = _parse(batch, needed)
+            # A last line without its end is being written, or was when the machine went down.
+            damaged += lost - (lost > 0 and not batch[-1].endswith(b"\n") and not _dictionary(batch[-1], needed))
+            if lines:
+                parts.append(_columns(lines))
+    return Log(_concatenate(parts), damaged)
+
+
+def _parse(batch: list[bytes], needed: tuple[str, ...]) -> tuple[list[dict[str, Any]], int]:
+    """The batch's dictionaries, and how many of its lines hold none."""
+    try:
+        lines = json.loads(b"[" + b",".join(batch) + b"]")  # at once: twice as fast as line by line
+        if len(lines) == len(batch) and all(_has(line, needed) for line in lines):
+            return lines, 0
+    except (ValueError, RecursionError):
+        pass
+    found = [_dictionary(line, needed) for line in batch if line.strip()]
+    return [line for line in found if line], sum(line is None for line in found)
+
+
+def _dictionary(line: bytes, needed: tuple[str, ...]) -> dict[str, Any] | None:
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):  # ValueError: also bytes that are no UTF-8
+        return None
+    return found if _has(found, needed) else None
+
+
+def _has(line: Any, needed: tuple[str, ...]) -> bool:
+    """Whether a line is a dictionary with these numbers."""
+    return isinstance(line, dict) and all(
+        type(line.get(name)) in (int, float) or line.get(name) == INFINITY for name in needed
+    )
+
+
+def _columns(lines: list[dict[str, Any]]) -> Columns:
+    names = dict.fromkeys(name for line in lines for name in line)
+    found = {name: _column([line.get(name) for line in lines]) for name in names}
+    return {name: column for name, column in found.items() if column is not None}
+
+
+def _column(values: list[Any]) -> Array | None:
+    """[L] floats, or [L, ...] where the values are lists, flattened. None where they are no numbers of one shape."""
+    column: Array | None
+    try:
+        column = np.array(values, float)  # None becomes NaN, "inf" infinity
+    except (TypeError, ValueError):
+        column = _with_gaps(values)
+    # Lists are probabilities of members, most of a log, and float32 themselves.
+    return column if column is None or column.ndim < 2 else column.reshape(len(column), -1).astype(np.float32)
+
+
+def _with_gaps(values: list[Any]) -> Array | None:
+    """As `_column`, where some values are lists and others null."""
+    like = next((value for value in values if isinstance(value, list)), None)
+    if like is None:
+        return None
+    try:
+        nothing = np.full(np.shape(like), np.nan)
+        return np.array([nothing if value is None else value for value in values], float)
+    except (TypeError, ValueError):
+        return None
+
+
+def _concatenate(parts: list[Columns]) -> Columns:
+    """One column of each name, NaN where a part does not have it."""
+    shapes = {name: column.shape[1:] for part in parts for name, column in part.items()}
+    sizes = [len(next(iter(part.values()))) for part in parts]
+
+    def whole(name: str, shape: tuple[int, ...]) -> Array:
+        kind = np.float32 if shape else float
+        there = (
+            part[name] if name in part else np.full((size, *shape), np.nan, kind)
+            for part, size in zip(parts, sizes, strict=True)
+        )
+        return np.concatenate(list(there))
+
+    return {name: whole(name, shape) for name, shape in shapes.items()}
+
+
+def _where(columns: Columns, values: Mapping[str, float]) -> Columns:
+    """The rows in which columns have the given values."""
+    if not columns:
+        return {}
+    chosen = np.logical_and.reduce([columns[name] == value for name, value in values.items()])
+    return {name: column[chosen] for name, column in columns.items()}
+
+
+def _rising(epochs: Columns) -> Columns:
+    """By steps; of several lines of one step the last."""
+    steps = epochs["env_steps"]
+    _, last = np.unique(steps[::-1], return_index=True)
+    order = len(steps) - 1 - last
+    return {name: column[order] for name, column in epochs.items()}
