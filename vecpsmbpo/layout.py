@@ -109,7 +109,7 @@ class Layout:
 
         Args:
             batched: leaves [N_local, ...] or [P_local, ...].
-            shared: what `function` needs of its seed otherwise; it must not close over any of it.
+            shared: what `function` needs of the state otherwise; it must not close over any of it.
         """
         if not self.sequential:
             return jax.vmap(lambda *one: function(*one, *shared))(*batched)

@@ -41,10 +41,12 @@ class Slbo(Algorithm):
 
     def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""
-        layout, rows = self.layout, counters.env_steps
-        whitening = dynamics.scaling(state.moments, rows, self.settings)
+        layout = self.layout
+        whitening = dynamics.scaling(state.moments, counters.env_steps, self.settings)
 
-        def learn(model, agent, key, real, whitening, hyper):
+        def learn(model, agent, key, counters, real, whitening, hyper):
+            rows = counters.env_steps
+
             def round_(learned, key):
                 model, agent = learned
                 model_key, policy_key = jax.random.split(key)
@@ -64,7 +66,8 @@ class Slbo(Algorithm):
 
         def learned(models, agents):
             keys = layout.keys(key, layout.member_ids())
-            return layout.map_local(learn, models, agents, keys, shared=(state.real, whitening, state.hyper))
+            shared = counters, state.real, whitening, state.hyper
+            return layout.map_local(learn, models, agents, keys, shared=shared)
 
         models, agents = jax.lax.cond(enabled, learned, lambda *same: same, state.models, state.agents)
         return state.replace(models=models, agents=agents)
