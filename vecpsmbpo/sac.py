@@ -4,7 +4,7 @@ As in Acme, and as the paper says: twin Q functions and no value network, so tha
 min(Q_1, Q_2) - α log π under the target critic; the temperature α is learned.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -165,21 +165,17 @@ def update(
     )
 
 
-def updates(
-    agent: Agent,
-    batches: Transition,
-    hyper: Hyper,
-    key: jax.Array,
-    *,
-    nets: Networks,
-    limits: Limits | None = None,
-    target_every: int = 1,
-) -> Agent:
-    """G updates in a row. Args: batches: leaves [G, B, ...]."""
+def updates(agent: Agent, batches: Transition, hyper: Hyper, key: jax.Array, **how: Any) -> Agent:
+    """G updates in a row.
+
+    Args:
+        batches: leaves [G, B, ...].
+        how: the keywords of `update`.
+    """
 
     def body(agent, xs):
         batch, key = xs
-        return update(agent, batch, hyper, key, nets=nets, limits=limits, target_every=target_every), None
+        return update(agent, batch, hyper, key, **how), None
 
     count = batches.reward.shape[0]
     return jax.lax.scan(body, agent, (batches, jax.random.split(key, count)))[0]
