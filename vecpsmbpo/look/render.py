@@ -64,11 +64,11 @@ def run(words: Sequence[str]) -> int:
     (path,) = arguments.run_dirs("render", named, most=1)
     out = options["out"]
     files.check_writable(out)
-    if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise SettingError(f"out={out}: .mp4 needs imageio-ffmpeg; pip install 'vecpsmbpo[video]', or take .gif")
     found = runs.load(path)
     if "host" not in registry.TASKS[found.settings.env].backends:
         raise SettingError(f"render: env={found.settings.env} has no simulator on the host that could draw it")
+    if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise SettingError(f"out={out}: .mp4 needs imageio-ffmpeg; pip install 'vecpsmbpo[video]', or take .gif")
     os.environ["MUJOCO_GL"] = platform()
     frames, frame_s = film(found, options)
     files.write(out, functools.partial(_write, frames, frame_s))
