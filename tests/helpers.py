@@ -14,7 +14,7 @@ import numpy as np
 from vecpsmbpo import algorithms, config, metrics
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.train import initial_inputs
+from vecpsmbpo.training.programs import initial_inputs
 from vecpsmbpo.types import EnvSpec, SeedState
 
 METRICS = {

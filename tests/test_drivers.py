@@ -13,7 +13,7 @@ from tests.helpers import algorithm, assert_probabilities_follow, tiny
 from vecpsmbpo import metrics, replay, sac
 from vecpsmbpo.drivers import HostDriver, ScanDriver
 from vecpsmbpo.drivers.common import split_for_episodes
-from vecpsmbpo.train import evaluation_keys, initial_inputs
+from vecpsmbpo.training.programs import evaluation_keys, initial_inputs
 
 DISCOUNT = 0.5
 STEPS = 600

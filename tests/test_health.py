@@ -18,9 +18,10 @@ import pytest
 from tests import probes
 from tests.helpers import algorithm, argv, initial, tiny
 from tests.test_resume import without_times
-from vecpsmbpo import checkpoint, evaluate, health, metrics, replay, train
+from vecpsmbpo import checkpoint, evaluate, health, metrics, replay, training
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.settings import Settings
+from vecpsmbpo.training import programs
 from vecpsmbpo.types import Counters, TrainState
 
 MAKE = {"mjx": "tests.probes:FailingProbe", "host": "tests.probes:FailingGymnasium"}
@@ -56,7 +57,7 @@ def killed_at(step: int, settings: Settings, monkeypatch: pytest.MonkeyPatch) ->
     with monkeypatch.context() as patch:
         patch.setattr(checkpoint.Checkpoints, "save", kill)
         with pytest.raises(Killed):
-            train.train(settings)
+            training.train(settings)
 
 
 def final(settings: Settings) -> TrainState:
@@ -84,7 +85,7 @@ def healthy(backend, tmp_path_factory):
     """The run in which nothing diverges, and what it said."""
     settings = settings_for(backend, GOOD, tmp_path_factory.mktemp(backend) / "run")
     with contextlib.redirect_stdout(io.StringIO()) as screen:
-        assert train.train(settings) == 0
+        assert training.train(settings) == 0
     return settings, final(settings), screen.getvalue()
 
 
@@ -96,7 +97,7 @@ def diverged(backend, tmp_path_factory):
         killed_at(80, settings, monkeypatch)
         good = final(settings)
         killed_at(120, settings, monkeypatch)
-    assert train.train(settings) == 1
+    assert training.train(settings) == 1
     return settings, good, final(settings)
 
 
@@ -137,7 +138,7 @@ def test_the_lane_s_last_line_says_when_and_where(diverged, capsys):
     assert re.fullmatch(r"agents\..* of policy n = [01], m = [01]", lines[-1]["not_finite"])
     assert episodes[-1]["env_steps"] <= FIRST_LEARNING_STEP
     # A run that is complete has the same status, and says it again.
-    assert train.train(settings) == 1
+    assert training.train(settings) == 1
     said = capsys.readouterr().out
     assert (
         f"seed 0, policy_learning_rate 1e+30 is frozen as it was at step {FIRST_LEARNING_STEP}: "
@@ -148,14 +149,14 @@ def test_the_lane_s_last_line_says_when_and_where(diverged, capsys):
 def test_a_run_whose_lanes_are_all_frozen_stops(tmp_path, capsys):
     """Its last checkpoint can be loaded, is finite, and is not gone on from."""
     settings = settings_for("host", [1e30, 2e30, 3e30, 4e30], tmp_path / "run")
-    assert train.train(settings) == 1
+    assert training.train(settings) == 1
     assert "every lane is frozen" in capsys.readouterr().out
     state = final(settings)
     leaves = leaves_of((state.seeds.replace(hyper=None), state.env), slice(None))
     assert all(np.isfinite(leaf).all() for leaf in leaves)
     lines = strict(tmp_path / "run" / "metrics.jsonl")
     assert [line["env_steps"] for line in lines if line.get("frozen")] == [FROZEN_AT] * 4
-    assert train.train(settings) == 1
+    assert training.train(settings) == 1
     assert strict(tmp_path / "run" / "metrics.jsonl") == lines
 
 
@@ -217,7 +218,7 @@ def test_what_a_simulator_returns_is_stored_only_if_it_is_finite(healthy):
 def test_evaluation_ends_where_a_simulator_fails(healthy):
     settings, _, _ = healthy
     driver, saved = evaluate.restore(settings)
-    returns = driver.evaluate(saved.state, train.evaluation_keys(settings, 1), 20)
+    returns = driver.evaluate(saved.state, programs.evaluation_keys(settings, 1), 20)
     assert np.isfinite(returns.episode_return).all()
     assert len(np.unique(returns.length)) > 1
 

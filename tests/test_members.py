@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import vecpsmbpo
 from tests import looks
 from tests.helpers import command
 from vecpsmbpo import cli
-from vecpsmbpo.evaluate import load_policy
 from vecpsmbpo.look import members, render, runs
 
 # What rendering needs of the machine; without it (a bare container) the tests of pictures have nothing to test.
@@ -53,7 +53,7 @@ def test_members_act_as_the_policy_that_is_loaded(trained):
     named = dict(members.acting(lane, "all"))
     assert list(named) == ["0,0", "0,1", "1,0", "1,1"]
     obs = np.random.default_rng(0).normal(size=(7, 5)).astype(np.float32)
-    expected = load_policy(trained)[1](obs)
+    expected = vecpsmbpo.load(trained).policy(obs)
     np.testing.assert_allclose(best(obs), expected, atol=1e-6)
     np.testing.assert_allclose(named[members.member_names(run)[lane.best()]](obs), expected, atol=1e-6)
     actions = [np.asarray(act(obs)) for act in named.values()]
@@ -64,7 +64,7 @@ def test_an_exported_policy_acts_the_same_without_this_package(trained, tmp_path
     out = tmp_path / "policy"
     assert cli.main(["export", str(trained), f"out={out}"]) == 0
     obs = np.random.default_rng(0).normal(size=(7, 5)).astype(np.float32)
-    expected = np.asarray(load_policy(trained)[1](obs))
+    expected = np.asarray(vecpsmbpo.load(trained).policy(obs))
     np.save(tmp_path / "obs.npy", obs)
     code = (
         "import sys, numpy as np; sys.path.insert(0, sys.argv[1]); from act import act; "

@@ -13,7 +13,7 @@ from tests.test_drivers import make_driver
 from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, planning
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.train import evaluation_keys, initial_inputs
+from vecpsmbpo.training.programs import evaluation_keys, initial_inputs
 from vecpsmbpo.types import EnvSpec, Hyper
 
 LIMIT = 3.5

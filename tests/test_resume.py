@@ -15,9 +15,11 @@ import jax
 import numpy as np
 import pytest
 
+import vecpsmbpo
 from tests.helpers import argv, assert_probabilities_follow, check_log, command, environment, tiny
-from vecpsmbpo import config, evaluate, metrics, train
+from vecpsmbpo import config, evaluate, metrics, training
 from vecpsmbpo.settings import SettingError
+from vecpsmbpo.training import guards
 
 SMALL = ["env=cartpole_swingup", "size=tiny", "num_seeds=2", "total_steps=200"]
 
@@ -128,9 +130,9 @@ def test_a_host_run_resumes_exactly(algo, switches, tmp_path):
     assert_same_run(tmp_path / "twice", tmp_path / "once")
     if algo == "pets":
         with pytest.raises(SettingError, match="algo=pets plans its actions"):
-            evaluate.load_policy(tmp_path / "once")
+            vecpsmbpo.load(tmp_path / "once").policy  # noqa: B018
     else:
-        actions = evaluate.load_policy(tmp_path / "once")[1](np.ones((4, 11)))
+        actions = vecpsmbpo.load(tmp_path / "once").policy(np.ones((4, 11)))
         assert actions.shape == (4, 3)
         assert np.all(np.abs(actions) <= 1)
 
@@ -163,7 +165,7 @@ def short_run(tmp_path_factory):
     """A finished host run of this process, and its settings."""
     folder = tmp_path_factory.mktemp("short")
     settings = tiny(env="ball_in_cup", backend="host", run_dir=folder / "run")
-    assert train.train(settings) == 0
+    assert training.train(settings) == 0
     return settings
 
 
@@ -172,7 +174,8 @@ def test_a_policy_is_loaded_from_a_run(posterior, short_run, tmp_path):
     """Of the best member, or of all where they act together; mean actions against a forward pass written in numpy."""
     shutil.copytree(short_run.run_dir, tmp_path / "run")
     config.save(dataclasses.replace(short_run, posterior=posterior, run_dir=str(tmp_path / "run")), tmp_path / "run")
-    settings, act = evaluate.load_policy(tmp_path / "run")
+    run = vecpsmbpo.load(tmp_path / "run")
+    settings, act = run.settings, run.policy
     assert settings == config.load(tmp_path / "run")
     driver, saved = evaluate.restore(settings)
     seeds = driver.layout.unpad(saved.state).seeds
@@ -214,7 +217,7 @@ def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(short_run, tmp
     before = _files(folder)
     assert evaluate.restore(settings)[1].step == 80
     assert _files(folder) == before  # looking at a run changes nothing
-    assert train.train(settings) == 0
+    assert training.train(settings) == 0
     printed = capsys.readouterr()
     assert "the checkpoint at step 120 is damaged; taking the one before it" in printed.err
     assert "resuming at step 80" in printed.out
@@ -229,19 +232,19 @@ def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp
     _damage(folder, 80)
     logs = {name: (folder / name).read_bytes() for name in ("metrics.jsonl", "episodes.jsonl")}
     with pytest.raises(SettingError, match="holds checkpoints, but none that can be read"):
-        train.train(dataclasses.replace(short_run, run_dir=str(folder)))
+        training.train(dataclasses.replace(short_run, run_dir=str(folder)))
     assert {name: (folder / name).read_bytes() for name in logs} == logs
     assert {path.name for path in (folder / "checkpoints").iterdir()} >= {"80", "120"}
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(short_run):
-    with train._alone_in(Path(short_run.run_dir)), pytest.raises(SettingError, match="another process is training"):
-        train.train(short_run)
+    with guards.alone_in(Path(short_run.run_dir)), pytest.raises(SettingError, match="another process is training"):
+        training.train(short_run)
 
 
 def test_a_run_goes_on_where_the_system_has_no_locks(tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "fcntl", None)
-    with train._alone_in(tmp_path), train._alone_in(tmp_path / "not even looked at"):
+    monkeypatch.setattr(guards, "fcntl", None)
+    with guards.alone_in(tmp_path), guards.alone_in(tmp_path / "not even looked at"):
         pass
 
 
@@ -256,11 +259,11 @@ def test_a_disk_that_fills_up_stops_the_run_in_one_line(short_run, tmp_path, mon
 
     monkeypatch.setattr(metrics, "_append", full)
     settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
-    with pytest.raises(train.DiskError, match=r"cannot be written \(No space left on device\)"):
-        train.train(settings)
+    with pytest.raises(training.DiskError, match=r"cannot be written \(No space left on device\)"):
+        training.train(settings)
     monkeypatch.undo()
     assert evaluate.restore(settings)[1].step == 40
-    assert train.train(settings) == 0
+    assert training.train(settings) == 0
     check_log(tmp_path / "run", settings)
 
 

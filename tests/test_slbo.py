@@ -13,7 +13,7 @@ from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, multistep, networks, replay, trpo
 from vecpsmbpo.envs import specs
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.train import evaluation_keys, initial_inputs
+from vecpsmbpo.training.programs import evaluation_keys, initial_inputs
 from vecpsmbpo.types import EnvSpec, Hyper, Transition
 
 SPEC = specs.get("ball_in_cup")

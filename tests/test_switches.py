@@ -15,7 +15,7 @@ from tests.test_drivers import make_driver, settings_for
 from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, mixture, posterior, sac
 from vecpsmbpo.envs import specs
-from vecpsmbpo.train import initial_inputs
+from vecpsmbpo.training.programs import initial_inputs
 from vecpsmbpo.types import Bandit, Counters, Hyper
 
 # ── forced exploration (equation 33) ─────────────────────────────────────────────────────────────────────────────

@@ -27,7 +27,7 @@ from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.train import initial_inputs, make_driver
+from vecpsmbpo.training.programs import initial_inputs, make_driver
 from vecpsmbpo.types import TrainState
 
 PAPER = [

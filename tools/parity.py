@@ -30,7 +30,8 @@ import scipy.stats
 from rich.console import Console
 from rich.table import Table
 
-from vecpsmbpo import envs, evaluate
+import vecpsmbpo
+from vecpsmbpo import envs
 from vecpsmbpo.envs import registry, termination
 from vecpsmbpo.envs.mjx.simulator import Physics
 from vecpsmbpo.settings import SettingError
@@ -227,9 +228,10 @@ def compare_episodes(port: Port, name: str, policy: Policy, count: int) -> dict[
 
 
 def trained_policy(run_dir: str) -> tuple[str, Policy]:
-    """The task of a run, and the policy that `load_policy` gives of it."""
-    settings, policy = evaluate.load_policy(run_dir)
-    return settings.env, lambda obs, t, key: policy(obs)
+    """The task of a run, and its policy."""
+    run = vecpsmbpo.load(run_dir)
+    policy = run.policy
+    return run.settings.env, lambda obs, t, key: policy(obs)
 
 
 def rows_of(name: str, trained: dict[str, Policy], states: int, episodes: int) -> Iterator[dict[str, Any]]:

@@ -90,7 +90,7 @@ def _train(overrides: list[str]) -> int:
 
 
 def _run(settings: Settings) -> int:
-    from vecpsmbpo.train import DiskError, train
+    from vecpsmbpo.training import DiskError, train
 
     try:
         return train(settings)
@@ -137,10 +137,10 @@ def _multirun(overrides: list[str]) -> int:
 def _eval(rest: list[str]) -> int:
     from vecpsmbpo import config
 
-    stored, settings = config.resolve_evaluation(rest)
-    from vecpsmbpo.evaluate import evaluate
+    stored, settings = config.parse_evaluation(rest)
+    from vecpsmbpo.evaluate import show
 
-    return evaluate(stored, settings)
+    return show(stored, settings)
 
 
 def _envs(rest: list[str]) -> int:

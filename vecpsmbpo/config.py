@@ -3,7 +3,7 @@
 import dataclasses
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -247,7 +247,7 @@ EVALUATION = {
 }
 
 
-def resolve_evaluation(overrides: Sequence[str]) -> tuple[Settings, Settings]:
+def parse_evaluation(overrides: Sequence[str]) -> tuple[Settings, Settings]:
     """Settings of the run in `run_dir=`, as stored and as they are to be evaluated.
 
     Raises:
@@ -262,12 +262,67 @@ def resolve_evaluation(overrides: Sequence[str]) -> tuple[Settings, Settings]:
     if "run_dir" not in given:
         raise SettingError("run_dir: eval needs run_dir=…, a directory that train has written")
     stored = load(given.pop("run_dir"))
+    return stored, for_evaluation(stored, given)
+
+
+def for_evaluation(stored: Settings, given: Mapping[str, Any]) -> Settings:
+    """The settings of a run as it is to be evaluated.
+
+    Args:
+        given: values by the names in `EVALUATION`.
+
+    Raises:
+        SettingError: a name that there is not, or a value that it cannot have.
+    """
     changes = {}
     for name, value in given.items():
+        if name not in EVALUATION:
+            raise SettingError(f"{name}={value}: evaluation takes {', '.join(EVALUATION)}")
         setting = EVALUATION[name]
         try:
             changes[setting] = check(setting, value)
         except SettingError:
             raise SettingError(f"{name}={value}: must be {allowed(setting)}") from None
     changes["backend"] = registry.resolve_backend(stored.env, changes.get("backend", stored.backend))
-    return stored, dataclasses.replace(stored, **changes)
+    return dataclasses.replace(stored, **changes)
+
+
+# ── the same from Python ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def overrides_of(settings: Mapping[str, Any]) -> list[str]:
+    """`name=value` as a command line would have it, of settings by name; `env_options` and `sweep` hold the settings
+    `env.*` and `sweep.*`.
+
+    Raises:
+        SettingError: a value is of a type that no setting has.
+    """
+    dots = {kept: f"{group}." for group, kept in _DOTTED.items()}
+    found = []
+    for name, value in settings.items():
+        if name not in dots:
+            found.append(f"{name}={_written(name, value)}")
+        elif not isinstance(value, Mapping):
+            raise SettingError(f"{name}={value}: must be a dictionary")
+        else:
+            found += [f"{dots[name]}{inner}={_written(inner, item)}" for inner, item in value.items()]
+    return found
+
+
+def _written(name: str, value: Any) -> str:
+    """A value as Hydra reads it back."""
+    if hasattr(value, "tolist"):  # of NumPy or JAX
+        value = value.tolist()
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return "[" + ",".join(_written(name, item) for item in value) + "]"
+    if not isinstance(value, str | Path):
+        raise SettingError(f"{name}={value!r}: must be a number, a string, or a list of them")
+    text = str(value)
+    if re.fullmatch(r"[A-Za-z_./][\w./+-]*", text) and yaml.safe_load(text) == text:
+        return text
+    quoted = re.sub(r"(\\*)'", r"\1\1\\'", text)  # backslashes count before a quote, and at the end
+    return "'" + re.sub(r"(\\+)$", r"\1\1", quoted) + "'"

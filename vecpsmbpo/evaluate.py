@@ -1,41 +1,40 @@
-"""`vecpsmbpo eval`: whole episodes of a trained run's policies."""
+"""Whole episodes of a trained run's policies: what `vecpsmbpo eval` shows and `Run.evaluate` returns."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
-import jax
-import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from vecpsmbpo import checkpoint, config, crash, resources, runtime
-from vecpsmbpo.drivers import Driver
-from vecpsmbpo.drivers.common import evaluation_policies
+from vecpsmbpo import checkpoint, crash, resources, runtime
+from vecpsmbpo.drivers import Driver, Returns
 from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.train import evaluation_keys, initial_inputs, make_driver
+from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
 
 
-def evaluate(stored: Settings, settings: Settings) -> int:
-    """Prints the returns of `settings.eval_episodes` episodes per seed from the newest checkpoint.
+def evaluate(stored: Settings, settings: Settings) -> tuple[int, Returns]:
+    """Episodes of the newest checkpoint, and the environment steps after which it was written.
 
     Args:
         stored: of the run.
-        settings: the same, with the backend and the policy to evaluate (`config.resolve_evaluation`).
+        settings: the same, with the backend and the policy to evaluate (`config.for_evaluation`).
 
     Raises:
         SettingError: the run holds no checkpoint.
     """
-    runtime.configure(settings)
     stored = replace(stored, devices=settings.devices)
     trained, saved = restore(stored)
     driver = trained if settings == stored else make_driver(settings)
     crash.doing("evaluating")
-    returns = driver.evaluate(saved.state, evaluation_keys(settings, saved.step), settings.eval_episodes)
+    keys = evaluation_keys(settings, saved.step)
+    return saved.step, driver.evaluate(saved.state, keys, settings.eval_episodes)
+
+
+def show(stored: Settings, settings: Settings) -> int:
+    """Prints what `evaluate` finds; the exit status."""
+    step, returns = evaluate(stored, settings)
     who = f"policy: {settings.eval_policy}, {settings.eval_actions} actions"
-    table = Table(title=f"{settings.task} ({settings.backend}) at step {saved.step}, {who}")
+    table = Table(title=f"{settings.task} ({settings.backend}) at step {step}, {who}")
     for column in (*settings.lanes[0], "episodes", "return", "± s.d.", "lowest", "highest", "length"):
         table.add_column(column, justify="right")
     for index, lane in enumerate(settings.lanes):
@@ -52,6 +51,7 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
     Raises:
         SettingError: the run holds no checkpoint, or there is not enough memory for it.
     """
+    runtime.configure(stored)
     driver = make_driver(stored)
     shapes = driver.shapes(*initial_inputs(stored))
     resources.check_memory(stored, driver.algorithm.spec, driver.layout, shapes)
@@ -61,31 +61,3 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
     if saved is None:
         raise SettingError(f"run_dir={stored.run_dir}: holds no checkpoint yet")
     return driver, saved
-
-
-def load_policy(run_dir: str | Path) -> tuple[Settings, Callable[[jax.Array], jax.Array]]:
-    """A trained policy of the first seed, to be used outside of this program: of the best member (`posterior.best`);
-    with `posterior=average`, where nobody earns anything, the mean of all members' actions.
-
-    Returns:
-        The run's settings, and its mean action as a jitted function: obs [..., O] -> action [..., A] in [-1, 1].
-
-    Raises:
-        SettingError: there is no run in `run_dir`, it holds no checkpoint, or its algorithm has no policy (PETS).
-    """
-    settings = config.load(run_dir)
-    if settings.plans:
-        raise SettingError(f"run_dir={run_dir}: algo={settings.algo} plans its actions; there is no policy to load")
-    one = replace(settings, posterior="sample", eval_policy="best", eval_actions="mean")
-    driver, saved = restore(one)
-    algorithm, seeds = driver.algorithm, saved.state.seeds
-    step, key = jnp.int32(0), jax.random.key(0)  # a policy, unlike a plan, needs neither
-
-    def action(policy: Any, obs: jax.Array) -> jax.Array:
-        return algorithm.evaluation_action(policy, step, algorithm.memory(), obs, key)[0]
-
-    if settings.posterior == "average":
-        members = jax.tree.map(lambda x: x[0], driver.layout.unpad(saved.state).seeds.agents.actor)
-        return settings, jax.jit(lambda obs: jax.vmap(action, (0, None))(members, obs).mean(axis=0))
-    policy = jax.tree.map(lambda x: x[0], evaluation_policies(algorithm)(seeds, seeds.key))
-    return settings, jax.jit(partial(action, policy))

@@ -28,12 +28,11 @@ def configure(settings: Settings) -> None:
             jax.config.update("jax_num_cpu_devices", cores)
         except RuntimeError:  # a backend is there already: an earlier job's, or of a program that imports this package
             logging.getLogger(__name__).debug("JAX is already initialised; its devices are used as they are")
+    jax.config.update("jax_enable_compilation_cache", settings.compile_cache)
     if settings.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(cache_dir()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
         jax.config.update("jax_raise_persistent_cache_errors", False)
-    else:
-        jax.config.update("jax_enable_compilation_cache", False)
 
 
 def cache_dir() -> Path:

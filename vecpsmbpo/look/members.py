@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import posterior, runtime, sac
+from vecpsmbpo import posterior, sac
 from vecpsmbpo.algorithms import Algorithm
 from vecpsmbpo.drivers.common import evaluation_policies
 from vecpsmbpo.evaluate import restore
@@ -65,7 +65,6 @@ def load(run: Run, lane: int = 0) -> Trained:
     settings = run.settings
     if lane >= len(settings.lanes):
         raise SettingError(f"lane={lane}: must be below {len(settings.lanes)}, the lanes of {run.path}")
-    runtime.configure(settings)
     driver, saved = restore(settings)
     return Trained(run, driver.algorithm, saved.step, lane, saved.state.seeds)
 
@@ -105,8 +104,14 @@ def member_names(run: Run) -> list[str]:
 
 
 def _evaluated(trained: Trained, who: str) -> Act:
-    """The mean action of the policy that `eval_policy=who` evaluates."""
-    algorithm = replace(trained.algorithm, settings=replace(trained.run.settings, eval_policy=who, eval_actions="mean"))
+    """The mean action of the policy that `eval_policy=who` evaluates; with `posterior=average`, where nobody earns
+    anything, the mean of all members' actions."""
+    settings = trained.run.settings
+    settings = replace(settings, eval_policy=who, eval_actions="mean")
+    if settings.posterior == "average":
+        actor, actors = sac.make_networks(settings, trained.algorithm.spec).actor, trained.actors()
+        return jax.jit(lambda obs: jax.vmap(lambda params: actor.law(params, obs).mode())(actors).mean(axis=0))
+    algorithm = replace(trained.algorithm, settings=settings)
     chosen = trained.of_lane(evaluation_policies(algorithm)(trained.state, trained.state.key))
     step, key = jnp.int32(0), jax.random.key(0)  # a policy, unlike a plan, needs neither
     return jax.jit(lambda obs: algorithm.evaluation_action(chosen, step, algorithm.memory(), obs, key)[0])

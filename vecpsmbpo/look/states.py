@@ -44,10 +44,8 @@ def visited(run: Run) -> Visited:
     Raises:
         SettingError: it holds no checkpoint.
     """
-    from vecpsmbpo import runtime  # and JAX with it
-    from vecpsmbpo.evaluate import restore
+    from vecpsmbpo.evaluate import restore  # and JAX with it
 
-    runtime.configure(run.settings)
     driver, saved = restore(run.settings)
     rings = np.asarray(saved.state.seeds.real)
     oldest = max(0, saved.step - rings.shape[1])

@@ -1,77 +1,25 @@
 """The one loop that does input and output: chunks of the compiled program, and what is kept of them."""
 
-import contextlib
-import dataclasses
-import errno
-import os
 import shlex
-import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import algorithms, checkpoint, config, crash, envs, health, metrics, resources, runtime, versions
-from vecpsmbpo.drivers import Driver, HostDriver, Returns, ScanDriver
+from vecpsmbpo import checkpoint, config, crash, health, metrics, resources, runtime, versions
+from vecpsmbpo.drivers import Driver, Returns
 from vecpsmbpo.look import report
 from vecpsmbpo.progress import Display, Rates, Stopwatch
-from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.types import Hyper, TrainState
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
+from vecpsmbpo.settings import Settings
+from vecpsmbpo.training.guards import Stop, alone_in, disk_errors, heeding_signals
+from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
+from vecpsmbpo.types import TrainState
 
 # An epoch that takes longer than this is run in chunks of about half of it, to show progress and to heed signals.
 LONG_EPOCH_S = 20.0
-
-
-# What the operating system says where a file cannot be written.
-DISK_ERRORS = frozenset(
-    {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
-    | {errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG}
-)
-
-
-class DiskError(Exception):
-    """The run directory cannot be written; the last checkpoint is whole."""
-
-
-def make_driver(settings: Settings) -> Driver:
-    """The algorithm on the task, on this process's devices. `runtime.configure` comes first.
-
-    Raises:
-        SettingError: there is no such task (`envs.make`).
-    """
-    make_env = partial(envs.make, settings.env, settings.backend, **dict(settings.env_options))
-    env = make_env(num_envs=len(settings.lanes), seed=settings.seed)
-    if not settings.episode_length:
-        settings = dataclasses.replace(settings, episode_length=env.spec.episode_length)
-    algorithm = algorithms.make(settings, env.spec)
-    return ScanDriver(algorithm, env) if settings.backend == "mjx" else HostDriver(algorithm, env, make_env)
-
-
-def initial_inputs(settings: Settings) -> tuple[jax.Array, Hyper]:
-    """A key [S] per seed, the same as if that seed ran alone; hyperparameters with leaves [S]."""
-    lanes = settings.lanes
-    keys = jax.vmap(jax.random.key)(jnp.array([lane["seed"] for lane in lanes]))
-    hyper = jax.tree.map(lambda x: jnp.full(len(lanes), x), Hyper.of(settings))
-    swept = {name: jnp.array([lane[name] for lane in lanes], jnp.float32) for name, _ in settings.sweep}
-    return keys, hyper.replace(**swept)
-
-
-def evaluation_keys(settings: Settings, env_steps: int) -> jax.Array:
-    """A key [S] per seed for the evaluation at `env_steps`; evaluating never moves the run's own keys."""
-    keys, _ = initial_inputs(settings)
-    return jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, 0xE7A1), env_steps))(keys)
 
 
 def train(settings: Settings) -> int:
@@ -89,15 +37,15 @@ def train(settings: Settings) -> int:
     shapes = driver.shapes(*initial_inputs(settings))
     memory = resources.check_memory(settings, driver.algorithm.spec, driver.layout, shapes)
     run_dir = Path(settings.run_dir)
-    with _disk_errors(run_dir):
+    with disk_errors(run_dir):
         run_dir.mkdir(parents=True, exist_ok=True)
-        with _alone_in(run_dir), _heeding_signals() as stop:
+        with alone_in(run_dir), heeding_signals() as stop:
             config.save(settings, run_dir)
             crash.doing("making the first state", run_dir)
-            return _Run(settings, driver, shapes, memory).go(stop)
+            return _Session(settings, driver, shapes, memory).go(stop)
 
 
-class _Run:
+class _Session:
     """One session of a run: from a checkpoint, or from nothing, to its end or a signal."""
 
     def __init__(self, settings: Settings, driver: Driver, shapes: TrainState, memory: str):
@@ -119,7 +67,7 @@ class _Run:
         self.epoch_steps_done = 0
         self.stride_s = float("inf")  # seconds per stride in the last chunk; infinite: not known
 
-    def go(self, stop: "_Stop") -> int:
+    def go(self, stop: Stop) -> int:
         settings = self.settings
         try:
             with self.display:
@@ -290,7 +238,7 @@ class _Run:
             self.checkpoints.save(self.env_steps, self.state, host, self.driver.layout)
             self.saved_step = self.env_steps
 
-    def _farewell(self, stop: "_Stop") -> int:
+    def _farewell(self, stop: Stop) -> int:
         self.display.say(f"saved at step {self.env_steps} of {self.settings.total_steps}: {self.run_dir}")
         if self.frozen.all():
             self.display.say("stopped: every lane is frozen; what is saved is the last good state of each")
@@ -300,66 +248,6 @@ class _Run:
             return 128 + (stop.requested or 0)
         self.display.say(f"to evaluate: vecpsmbpo eval {shlex.quote(f'run_dir={self.run_dir}')} episodes=10")
         return self._status
-
-
-@dataclasses.dataclass
-class _Stop:
-    requested: int | None = None
-
-
-@contextlib.contextmanager
-def _heeding_signals() -> Iterator[_Stop]:
-    """SIGINT and SIGTERM ask the run to stop after its chunk; a second one stops it at once."""
-    stop = _Stop()
-
-    def ask(number: int, frame: Any) -> None:
-        if stop.requested is not None:
-            raise KeyboardInterrupt
-        stop.requested = number
-        print("\nfinishing this chunk and saving; once more to stop at once", file=sys.stderr, flush=True)
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _alone_in(run_dir: Path) -> Iterator[None]:
-    """Keeps a second process from writing into the same run, as long as this one lives; where there are locks."""
-    if fcntl is None:
-        yield
-        return
-    handle = os.open(run_dir, os.O_RDONLY)
-    try:
-        with contextlib.suppress(OSError):  # some network file systems have no locks
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise SettingError(f"run_dir={run_dir}: another process is training in it") from None
-        yield
-    finally:
-        os.close(handle)
-
-
-@contextlib.contextmanager
-def _disk_errors(run_dir: Path) -> Iterator[None]:
-    """Turns a disk that cannot be written into one line."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in DISK_ERRORS:
-            raise
-        reason = os.strerror(error.errno)
-    except ValueError as error:  # orbax's storage layer reports a full disk so
-        if "No space left" not in str(error) and "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        reason = os.strerror(errno.ENOSPC)
-    else:
-        return
-    raise DiskError(f"run_dir={run_dir}: cannot be written ({reason})")
 
 
 def _warn(text: str) -> None:
