@@ -13,6 +13,7 @@ from vecpsmbpo import health
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers.common import (
     BY_SEED,
+    COMPILED_QUICKLY,
     SHARED,
     Returns,
     begin_stride,
@@ -48,7 +49,7 @@ class HostDriver:
         self._env.episode_length = self.settings.episode_length
         specs, seeds = self.layout.specs(), self.layout.specs().seeds
         spread, before = self.layout.spread, specs.without_rings()
-        self._init = spread(self._init_local, (BY_SEED, BY_SEED, BY_SEED), specs)
+        self._init = spread(self._init_local, (BY_SEED,) * 3, specs, compiler_options=COMPILED_QUICKLY)
         self._begin = spread(self._begin_local, (specs,), (before, specs, SHARED), donate_argnums=0)
         self._act = spread(self._act_local, (specs.counters, seeds, BY_SEED), (BY_SEED, BY_SEED, BY_SEED))
         self._observe = spread(

@@ -11,6 +11,7 @@ from vecpsmbpo import health
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers.common import (
     BY_SEED,
+    COMPILED_QUICKLY,
     SHARED,
     EpisodeKeys,
     Returns,
@@ -39,7 +40,7 @@ class ScanDriver:
         self.layout = algorithm.layout
         self.compile_seconds = 0.0
         specs = self.layout.specs()
-        self._init = self.layout.spread(self._init_local, (BY_SEED, BY_SEED), specs)
+        self._init = self.layout.spread(self._init_local, (BY_SEED,) * 2, specs, compiler_options=COMPILED_QUICKLY)
         self._run = self.layout.spread(self._run_local, (specs, SHARED), (specs, _LOG), donate_argnums=0)
         self._evaluate = self.layout.spread(self._evaluate_local, (specs.seeds, BY_SEED), (BY_SEED, BY_SEED))
         self._compiled: Any = None
