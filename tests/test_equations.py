@@ -193,7 +193,8 @@ def test_critic_loss_by_hand(key, agent):
     spec, nets, agent, _ = agent
     zero = jax.tree.map(jnp.zeros_like, agent.critic)
     batch = _batch(spec, reward=jnp.array([1.0, 3.0]))
-    loss, q_mean = jax.jit(partial(sac.critic_loss, nets=nets))(zero, agent, batch, jnp.float32(0.0), key)
+    noise = jnp.zeros_like(batch.action)
+    loss, q_mean = jax.jit(partial(sac.critic_loss, nets=nets))(zero, agent, batch, jnp.float32(0.0), noise)
     assert loss == pytest.approx(0.5 * (1 + 9) / 2 * 2)  # two critics
     assert q_mean == 0
 
@@ -213,26 +214,31 @@ def test_losses_take_the_smaller_of_the_two_critics(values, key, agent):
     the target 1 + 0.9 (2 - log π / 2)."""
     spec, nets, agent, _ = agent
     batch, alpha = _batch(spec, reward=jnp.ones(2)), jnp.float32(0.5)
-    loss, log_prob = sac.actor_loss(agent.actor, _answering(agent.critic, *values), alpha, batch.obs, key, nets=nets)
+    noise = jax.random.normal(key, batch.action.shape)
+    loss, log_prob = sac.actor_loss(agent.actor, _answering(agent.critic, *values), alpha, batch.obs, noise, nets=nets)
     assert loss == pytest.approx(0.5 * float(log_prob) - 2, abs=1e-5)
     _, log_prob = nets.actor.law(agent.actor, batch.next_obs).sample(key)
     target = 1 + 0.9 * (2 - 0.5 * np.asarray(log_prob))
     learner = agent.replace(target_critic=_answering(agent.critic, *values), log_alpha=jnp.log(alpha))
-    loss, _ = sac.critic_loss(_answering(agent.critic, 0.0, 1.0), learner, batch, jnp.float32(0.9), key, nets=nets)
+    loss, _ = sac.critic_loss(_answering(agent.critic, 0.0, 1.0), learner, batch, jnp.float32(0.9), noise, nets=nets)
     assert loss == pytest.approx(0.5 * np.mean(target**2 + (1 - target) ** 2), rel=1e-5)
+
+
+def _updated(update, agent, batch, hyper, key):
+    return update(agent, batch, sac.Noise.draw(key, batch.action.shape), hyper)
 
 
 def test_temperature_moves_towards_the_target_entropy(key, agent):
     spec, _, agent, update = agent
     for target, rises in ((50.0, True), (-50.0, False)):
         hyper = Hyper.of(tiny()).replace(target_entropy=jnp.float32(target))
-        after = update(agent, _batch(spec), hyper, key)
+        after = _updated(update, agent, _batch(spec), hyper, key)
         assert (after.log_alpha > agent.log_alpha) == rises
 
 
 def test_target_critic_is_a_running_average(key, agent):
     spec, _, agent, update = agent
-    after = update(agent, _batch(spec), Hyper.of(tiny()), key)
+    after = _updated(update, agent, _batch(spec), Hyper.of(tiny()), key)
     expected = jax.tree.map(lambda old, new: 0.995 * old + 0.005 * new, agent.target_critic, after.critic)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), after.target_critic, expected)
 

@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from tests.helpers import algorithm, environment, initial, tiny
 from vecpsmbpo import sac
 from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs import specs
-from vecpsmbpo.layout import Layout, _mesh_shape
+from vecpsmbpo.layout import Layout, _copies, _mesh_shape
 from vecpsmbpo.types import Counters, TrainState
 
 SPEC = specs.get("ball_in_cup")
@@ -90,7 +91,9 @@ def test_a_member_learns_as_a_single_agent_would(reference):
     )
     agent = jax.tree.map(lambda x: x[1], state.agents)
     nets = sac.make_networks(settings, SPEC)
-    single = sac.updates(agent, batches, state.hyper, jax.random.fold_in(update_key, 1), nets=nets)
+    shape = (settings.updates_per_step, settings.policy_batch_size, SPEC.action_size)
+    drawn = sac.Noise.draw(jax.random.fold_in(update_key, 1), shape)
+    single = sac.updates(agent, batches, drawn, state.hyper, nets=nets)
     _close(single, jax.tree.map(lambda x: x[0, 1], looped.agents))
 
 
@@ -138,24 +141,53 @@ def test_saving_rings_leaves_them_to_be_overwritten_in_place():
 
 
 @pytest.mark.parametrize(
-    ("lanes", "parts", "most", "shape"),
+    ("lanes", "models", "members", "most", "shape"),
     [
-        (1, 3, 2, (1, 2)),
-        (2, 3, 2, (2, 1)),
-        (3, 1, 2, (1, 1)),  # a second device could only run padding
-        (3, 2, 2, (1, 2)),
-        (10, 4, 8, (2, 4)),
-        (1, 25, 64, (1, 25)),
-        (5, 1, 4, (1, 1)),
-        (6, 25, 4, (2, 2)),
+        (1, 3, 3, 2, (1, 2)),
+        (2, 3, 3, 2, (2, 1)),
+        (3, 1, 1, 2, (1, 1)),  # a second device could only run padding
+        (3, 2, 2, 2, (1, 2)),
+        (10, 4, 4, 8, (2, 4)),
+        (1, 5, 25, 64, (1, 25)),
+        (5, 1, 1, 4, (1, 1)),
+        (6, 5, 25, 4, (2, 2)),
+        (1, 7, 1, 2, (1, 2)),
     ],
 )
-def test_the_mesh_gives_the_busiest_device_least_to_do(lanes, parts, most, shape):
-    found = _mesh_shape(lanes, parts, most)
-    work = lambda s, m: lanes // s * -(-parts // m)  # noqa: E731
+def test_the_mesh_gives_the_busiest_device_least_to_do(lanes, models, members, most, shape):
+    found = _mesh_shape(lanes, models, members, most)
+    work = lambda s, m: lanes // s * (-(-models // m) + -(-members // m))  # noqa: E731
     assert lanes % found[0] == 0
     assert work(*found) == work(*shape)
     assert found[0] * found[1] <= shape[0] * shape[1] <= most
+
+
+@pytest.mark.parametrize(
+    ("lanes", "models", "members", "batch", "most", "shape", "copies"),
+    [
+        (1, 1, 1, 256, 2, (1, 2), 2),  # MBPO, SAC: both cores learn
+        (2, 1, 1, 256, 2, (2, 1), 1),  # a core for each seed needs nothing of the other
+        (3, 1, 1, 256, 2, (1, 2), 2),
+        (1, 7, 1, 256, 4, (1, 4), 4),
+        (1, 1, 1, 255, 2, (1, 1), 1),  # rows that cannot be halved
+        (1, 2, 2, 256, 4, (1, 4), 2),
+        (1, 2, 2, 256, 3, (1, 2), 1),
+    ],
+)
+def test_devices_without_a_member_of_their_own_share_one(lanes, models, members, batch, most, shape, copies):
+    found = _mesh_shape(lanes, models, members, most, partial(_copies, members, batch))
+    assert (found, _copies(members, batch, found[1])) == (shape, copies)
+
+
+def test_a_member_that_devices_share_equals_one_on_one_device():
+    """Gradients of the parts of a minibatch, averaged, are those of the minibatch."""
+    settings = tiny(n_models=1, n_policies=1, devices=1)
+    alone = learned(settings, Layout.of(settings))
+    layout = Layout.of(dataclasses.replace(settings, devices=2))
+    assert (layout.copies, layout.padded_members) == (2, 2)
+    together = learned(settings, layout)
+    _close(together.agents, alone.agents)
+    np.testing.assert_array_equal(together.imagined, alone.imagined)
 
 
 EMPTY = """

@@ -85,7 +85,9 @@ def test_clipped_targets_enter_the_critics_loss(key):
     zero = jax.tree.map(jnp.zeros_like, agent.critic)
     obs, action = jnp.zeros((1, spec.obs_size)), jnp.zeros((1, spec.action_size))
     batch = Transition(obs, action, jnp.array([5.0]), obs, jnp.zeros(1))
-    loss, _ = sac.critic_loss(zero, agent, batch, jnp.float32(0.0), key, nets=nets, bounds=(0.0, 1.0))
+    loss, _ = sac.critic_loss(
+        zero, agent, batch, jnp.float32(0.0), jnp.zeros_like(action), nets=nets, bounds=(0.0, 1.0)
+    )
     assert loss == pytest.approx(1.0)
 
 
@@ -108,7 +110,8 @@ def test_the_target_critic_moves_at_every_fourth_update(key):
     batch = Transition(obs, jnp.zeros((2, spec.action_size)), jnp.ones(2), obs, jnp.zeros(2))
     moved = []
     for step in range(8):
-        before, agent = agent, update(agent, batch, hyper, jax.random.fold_in(key, step))
+        noise = sac.Noise.draw(jax.random.fold_in(key, step), batch.action.shape)
+        before, agent = agent, update(agent, batch, noise, hyper)
         same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), before.target_critic, agent.target_critic)
         moved.append(not all(jax.tree.leaves(same)))
     assert moved == [False, False, False, True] * 2

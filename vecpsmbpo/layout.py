@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from vecpsmbpo.settings import Settings
@@ -39,6 +40,8 @@ class Layout:
         sequential: members of one device, of one seed and of all, run one after the other instead of batched. On a CPU
             core, whose cache holds one member's parameters but not all of them, this is faster; the arithmetic is the
             same.
+        copies: how many devices share a member, where there are more devices than members: each holds all of it, draws
+            the same minibatches, and computes the gradients of its part of their rows.
     """
 
     mesh: Mesh
@@ -47,13 +50,16 @@ class Layout:
     n_policies: int
     n_members: int
     sequential: bool
+    copies: int = 1
 
     @classmethod
     def of(cls, settings: Settings) -> "Layout":
         """Uses the devices of the process that can be given work, of the first `settings.devices`."""
         devices = jax.devices()
         most = min(settings.devices or len(devices), len(devices))
-        shape = _mesh_shape(len(settings.lanes), max(settings.n_members, settings.n_models), most)
+        on_cpu = devices[0].platform == "cpu"
+        copies = partial(_copies, settings.n_members, settings.policy_batch_size if on_cpu else 1)
+        shape = _mesh_shape(len(settings.lanes), settings.n_models, settings.n_members, most, copies)
         grid = np.array(devices[: math.prod(shape)]).reshape(shape)
         return cls(
             mesh=Mesh(grid, (SEEDS, MEMBERS)),
@@ -61,7 +67,8 @@ class Layout:
             n_models=settings.n_models,
             n_policies=settings.n_policies,
             n_members=settings.n_members,
-            sequential=devices[0].platform == "cpu",
+            sequential=on_cpu,
+            copies=copies(shape[1]),
         )
 
     # how many there are
@@ -77,8 +84,9 @@ class Layout:
 
     @property
     def padded_members(self) -> int:
-        """P. Members from N·M on fill the mesh; the posterior never draws them and no file shows them."""
-        return -(-self.n_members // self.shards) * self.shards
+        """P. Members from N·M on fill the mesh; the posterior never draws them and no file shows them. Where devices
+        share members, each place counts: P = N·M · copies."""
+        return -(-self.n_members * self.copies // self.shards) * self.shards
 
     # inside the program, for one seed on one device
 
@@ -90,7 +98,7 @@ class Layout:
     def member_ids(self) -> jax.Array:
         """Indices n·M + m of this device's members."""
         local = self.padded_members // self.shards
-        return jax.lax.axis_index(MEMBERS) * local + jnp.arange(local)
+        return (jax.lax.axis_index(MEMBERS) * local + jnp.arange(local)) // self.copies
 
     def model_of(self, member: jax.Array) -> jax.Array:
         """n of member n·M + m; padding members share the last model."""
@@ -131,7 +139,7 @@ class Layout:
 
     def all_members(self, values: jax.Array) -> jax.Array:
         """What this device's members have, [P_local, ...] -> what all have, [N·M, ...]."""
-        return _everywhere(values)[: self.n_members]
+        return _everywhere(values)[:: self.copies][: self.n_members]
 
     def all_models_for_members(self, models: Any) -> Any:
         """This device's models [N_local, ...] -> all N of them for each of its members, [P_local, N, ...]."""
@@ -152,7 +160,7 @@ class Layout:
         """`function` of the leaves [...] that `member` has in `tree` [P_local, ...]: computed by every device for one
         of its own members, taken from the device where `member` lives."""
         local = self.padded_members // self.shards
-        index = member - jax.lax.axis_index(MEMBERS) * local
+        index = member * self.copies - jax.lax.axis_index(MEMBERS) * local
         here = (index >= 0) & (index < local)
         index = jnp.clip(index, 0, local - 1)
         answer = function(jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, index, keepdims=False), tree))
@@ -163,7 +171,28 @@ class Layout:
         """[P_local, ...] -> the mean over the N·M members, [...]."""
         real = self.member_ids() < self.n_members
         kept = jnp.where(real.reshape(-1, *(1,) * (values.ndim - 1)), values, 0.0)
-        return jax.lax.psum(jnp.sum(kept, axis=0), MEMBERS) / self.n_members
+        return jax.lax.psum(jnp.sum(kept, axis=0), MEMBERS) / (self.n_members * self.copies)
+
+    def part(self, tree: Any, axis: int) -> Any:
+        """This device's part, along `axis`, of what all devices that share a member have of it."""
+        if self.copies == 1:
+            return tree
+
+        def cut(x: jax.Array) -> jax.Array:
+            size = x.shape[axis] // self.copies
+            start = jax.lax.axis_index(MEMBERS) % self.copies * size
+            return jax.lax.dynamic_slice_in_dim(x, start, size, axis)
+
+        return jax.tree.map(cut, tree)
+
+    def mean_of_parts(self, tree: Any) -> Any:
+        """The mean of every leaf over the devices that share a member. As one array: a collective costs what a small
+        matrix product does, whatever it carries."""
+        if self.copies == 1:
+            return tree
+        groups = np.arange(self.shards).reshape(-1, self.copies).tolist()
+        flat, unravel = ravel_pytree(tree)
+        return unravel(jax.lax.pmean(flat, MEMBERS, axis_index_groups=groups))
 
     def least_of_members(self, values: jax.Array) -> jax.Array:
         """The smallest [] of what this and the other devices of the seed have."""
@@ -203,28 +232,36 @@ class Layout:
 
     def unpad(self, state: TrainState) -> TrainState:
         """`state` without the padding members and models: what a checkpoint holds, whatever mesh it came from."""
-        return self._resize(state, self.n_models, self.n_members)
+        return self._rearranged(state, np.arange(self.n_models), self.places_of_members)
 
     def place(self, state: TrainState) -> TrainState:
         """An unpadded state, padded to this mesh and laid out on it."""
-        padded = self._resize(state, self.padded_models, self.padded_members)
+        # Padding repeats what there is: any valid numbers do.
+        models = np.arange(self.padded_models) % self.n_models
+        padded = self._rearranged(state, models, self._members_at_places() % self.n_members)
         return jax.device_put(padded, self.shardings(padded))
 
-    def _resize(self, state: TrainState, models: int, members: int) -> TrainState:
-        seeds = state.seeds
-        if seeds.agents.stats.updates.shape[1] == members and seeds.models.loss.shape[1] == models:
-            return state
+    @property
+    def places_of_members(self) -> np.ndarray:
+        """[N·M] where on the axis [P] each member lies, first."""
+        return np.arange(self.n_members) * self.copies
 
-        def resize(tree, count):
-            # Padding repeats the first entry: any valid numbers do.
-            index = lambda x: slice(count) if count <= x.shape[1] else np.arange(count) % x.shape[1]  # noqa: E731
-            return jax.tree.map(lambda x: x[:, index(x)], tree)
+    def _members_at_places(self) -> np.ndarray:
+        """[P] which member lies there; from N·M on, padding."""
+        return np.arange(self.padded_members) // self.copies
+
+    def _rearranged(self, state: TrainState, models: np.ndarray, members: np.ndarray) -> TrainState:
+        """`state` with these of its models and these of its members."""
+        seeds = state.seeds
+
+        def chosen(tree: Any, which: np.ndarray) -> Any:
+            return jax.tree.map(lambda x: x if x.shape[1] == len(which) else x[:, which], tree)
 
         return state.replace(
             seeds=seeds.replace(
-                models=resize(seeds.models, models),
-                agents=resize(seeds.agents, members),
-                imagined=resize(seeds.imagined, members),
+                models=chosen(seeds.models, models),
+                agents=chosen(seeds.agents, members),
+                imagined=chosen(seeds.imagined, members),
             )
         )
 
@@ -241,7 +278,10 @@ class Layout:
             where: Any = shard.index
             for inside, place in zip(np.ndindex(part.shape[:-2]), _places(where[:-2], rings.shape), strict=True):
                 by_place[place] = part[inside]
-        return [by_place[place] for place in np.ndindex(self.num_seeds, *([members] if members else []))]
+        if members is None:
+            return [by_place[seed,] for seed in range(self.num_seeds)]
+        places = self.places_of_members[:members]
+        return [by_place[seed, int(place)] for seed in range(self.num_seeds) for place in places]
 
     def rings_from_host(self, saved: list[Any], like: Any, spec: PartitionSpec) -> jax.Array:
         """The inverse of `rings_to_host`, laid out on the mesh; padding members get empty rings.
@@ -252,8 +292,16 @@ class Layout:
             like: shape and type of the result.
             spec: how it lies on the mesh.
         """
-        count = [self.num_seeds] if len(like.shape) == 3 else [self.num_seeds, len(saved) // self.num_seeds]
-        number = {place: i for i, place in enumerate(np.ndindex(*count))}
+        of_members = len(like.shape) == 4
+        owners = self._members_at_places().tolist()
+
+        def number(place: tuple[int, ...]) -> int | None:
+            """Which of `saved` lies at a place."""
+            if not of_members:
+                return place[0]
+            seed, member = place[0], owners[place[1]]
+            return seed * self.n_members + member if member < self.n_members else None
+
         sharding = NamedSharding(self.mesh, spec)
         replicas: dict[tuple[tuple[int, ...], ...], list[Any]] = {}
         whole: Any = sharding.addressable_devices_indices_map(like.shape)
@@ -263,8 +311,10 @@ class Layout:
         for places, devices in replicas.items():
             part = np.zeros((len(places), *like.shape[-2:]), like.dtype)
             for row, place in zip(part, places, strict=True):
-                if place in number:
-                    row[:], saved[number[place]] = saved[number[place]], None
+                if (index := number(place)) is not None:
+                    row[:] = saved[index]
+                    if not of_members or (place[1] + 1) % self.copies == 0:  # the last that shares it
+                        saved[index] = None
             part = part.reshape(sharding.shard_shape(like.shape))
             parts += [jax.device_put(part, device) for device in devices]
         return jax.make_array_from_single_device_arrays(like.shape, sharding, parts)
@@ -289,16 +339,31 @@ def _making_empty_arrays(function: Callable) -> Callable:
     return body
 
 
-def _mesh_shape(lanes: int, parts: int, most: int) -> tuple[int, int]:
+def _mesh_shape(
+    lanes: int, models: int, members: int, most: int, copies: Callable[[int], int] = lambda shards: 1
+) -> tuple[int, int]:
     """Devices over seeds and over members, up to `most` together: such that the busiest has least to do, and no more of
     them than that takes.
 
     Args:
         lanes: S, which the devices over seeds must divide.
-        parts: what each of them has that members or models can be spread over; padded, where it does not divide.
+        models, members: N and N·M, which a device has whole numbers of; padded, where it does not divide.
+        copies: how many of so many devices would share a member.
     """
+
+    def work(seeds: int, shards: int) -> float:
+        of_members = -(-members * copies(shards) // shards) / copies(shards)
+        return lanes // seeds * (-(-models // shards) + of_members)
+
     shapes = [(s, m) for s in range(1, most + 1) if lanes % s == 0 for m in range(1, most // s + 1)]
-    return min(shapes, key=lambda shape: (lanes // shape[0] * -(-parts // shape[1]), math.prod(shape), shape[1]))
+    return min(shapes, key=lambda shape: (work(*shape), math.prod(shape), shape[1]))
+
+
+def _copies(members: int, batch: int, shards: int) -> int:
+    """How many of the `shards` devices share a member: all that there are to each, if they can cut its minibatches of
+    `batch` rows into equal parts."""
+    shared = shards // members
+    return shared if shards == members * shared and batch % shared == 0 else 1
 
 
 def _view(x: Any) -> np.ndarray:

@@ -137,9 +137,12 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     """What the train state says of the epoch that has just ended, one line per seed (and swept value).
 
     Null: there was nothing yet.
+
+    Args:
+        state: without padding (`Layout.unpad`); its rings are not looked at.
     """
     seeds = state.seeds
-    stats = {name: np.asarray(value)[:, : settings.n_members] for name, value in vars(seeds.agents.stats).items()}
+    stats = {name: np.asarray(value) for name, value in vars(seeds.agents.stats).items()}
     updates = stats.pop("updates")
     env_steps = int(state.counters.env_steps)
     fitted = np.asarray(seeds.models.optimizer.count)[:, 0] > 0

@@ -113,8 +113,11 @@ class TanhGaussian(NamedTuple):
     most: float = float("inf")
 
     def sample(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Reparameterized action [..., A] and its log-density [...]."""
-        noise = jax.random.normal(key, self.loc.shape)
+        """An action [..., A] and its log-density [...]."""
+        return self.reparameterized(jax.random.normal(key, self.loc.shape))
+
+    def reparameterized(self, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The action [..., A] that standard normal noise [..., A] becomes, and its log-density [...]."""
         pre_tanh = self.loc + self.scale * noise
         log_normal = -0.5 * noise**2 - jnp.log(self.scale) - 0.5 * jnp.log(2 * jnp.pi)
         # log(1 - tanh²u) = 2 (log 2 - u - softplus(-2u)): no cancellation where tanh saturates.

@@ -4,6 +4,7 @@ As in Acme, and as the paper says: twin Q functions and no value network, so tha
 min(Q_1, Q_2) - α log π under the target critic; the temperature α is learned.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +18,17 @@ from vecpsmbpo.types import Agent, AgentStats, EnvSpec, Hyper, Params, Transitio
 class Networks(NamedTuple):
     actor: networks.Actor
     critic: networks.TwinCritic
+
+
+class Noise(NamedTuple):
+    """What the actions of an update are drawn with: standard normal, [..., B, A] each, at s' and at s."""
+
+    next_action: jax.Array
+    action: jax.Array
+
+    @classmethod
+    def draw(cls, key: jax.Array, shape: tuple[int, ...]) -> "Noise":
+        return cls(*jax.random.normal(key, (2, *shape)))
 
 
 class Limits(NamedTuple):
@@ -79,13 +91,13 @@ def critic_loss(
     agent: Agent,
     batch: Transition,
     discount: jax.Array,
-    key: jax.Array,
+    noise: jax.Array,
     *,
     nets: Networks,
     bounds: tuple[jax.Array, jax.Array] | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """½ (Q - Q̂)² for both critics (equation 27), Q̂ within `bounds`, and the mean of Q over the batch."""
-    next_action, next_log_prob = nets.actor.law(agent.actor, batch.next_obs).sample(key)
+    """½ (Q - Q̂)² for both critics (equation 27), Q̂ within `bounds`, and the mean of Q over the batch. noise [B, A]."""
+    next_action, next_log_prob = nets.actor.law(agent.actor, batch.next_obs).reparameterized(noise)
     next_q = jnp.minimum(*nets.critic.values(agent.target_critic, batch.next_obs, next_action))
     alpha = jnp.exp(agent.log_alpha)
     target = target_value(batch.reward, batch.terminated, next_q, next_log_prob, alpha, discount)
@@ -96,10 +108,10 @@ def critic_loss(
 
 
 def actor_loss(
-    actor: Params, critic: Params, alpha: jax.Array, obs: jax.Array, key: jax.Array, *, nets: Networks
+    actor: Params, critic: Params, alpha: jax.Array, obs: jax.Array, noise: jax.Array, *, nets: Networks
 ) -> tuple[jax.Array, jax.Array]:
-    """E[α log π(a | s) - min Q(s, a)] (equations 25 and 28), and the mean log-probability."""
-    action, log_prob = nets.actor.law(actor, obs).sample(key)
+    """E[α log π(a | s) - min Q(s, a)] (equations 25 and 28), and the mean log-probability. noise [B, A]."""
+    action, log_prob = nets.actor.law(actor, obs).reparameterized(noise)
     q = jnp.minimum(*nets.critic.values(critic, obs, action))
     return jnp.mean(alpha * log_prob - q), jnp.mean(log_prob)
 
@@ -107,12 +119,13 @@ def actor_loss(
 def update(
     agent: Agent,
     batch: Transition,
+    noise: Noise,
     hyper: Hyper,
-    key: jax.Array,
     *,
     nets: Networks,
     limits: Limits | None = None,
     target_every: int = 1,
+    mean: Callable[[Any], Any] = lambda parts: parts,
 ) -> Agent:
     """One gradient step of critic, actor and temperature, and every `target_every` such steps one of the target
     critic's average.
@@ -120,20 +133,22 @@ def update(
     Args:
         batch: leaves [B, ...].
         limits: of rewards, if the critics' targets are to be kept within what these allow.
+        mean: of losses and gradients over the parts of a minibatch that lies on several devices.
     """
-    critic_key, actor_key = jax.random.split(key)
     rate = hyper.policy_learning_rate
 
     alpha = jnp.exp(agent.log_alpha)
     bounds = None if limits is None else target_range(limits, alpha, hyper, batch.action.shape[-1])
     critic_value_and_grad = jax.value_and_grad(critic_loss, has_aux=True)
-    (loss_q, q_mean), gradient = critic_value_and_grad(
-        agent.critic, agent, batch, hyper.discount, critic_key, nets=nets, bounds=bounds
+    (loss_q, q_mean), gradient = mean(
+        critic_value_and_grad(agent.critic, agent, batch, hyper.discount, noise.next_action, nets=nets, bounds=bounds)
     )
     critic, critic_optimizer = optim.step(gradient, agent.critic_optimizer, agent.critic, rate)
 
     actor_value_and_grad = jax.value_and_grad(actor_loss, has_aux=True)
-    (loss_pi, log_prob), gradient = actor_value_and_grad(agent.actor, critic, alpha, batch.obs, actor_key, nets=nets)
+    (loss_pi, log_prob), gradient = mean(
+        actor_value_and_grad(agent.actor, critic, alpha, batch.obs, noise.action, nets=nets)
+    )
     actor, actor_optimizer = optim.step(gradient, agent.actor_optimizer, agent.actor, rate)
 
     # ∂/∂(log α) of E[-α (log π + target entropy)]: entropy below its target raises α.
@@ -165,17 +180,15 @@ def update(
     )
 
 
-def updates(agent: Agent, batches: Transition, hyper: Hyper, key: jax.Array, **how: Any) -> Agent:
+def updates(agent: Agent, batches: Transition, noise: Noise, hyper: Hyper, **how: Any) -> Agent:
     """G updates in a row.
 
     Args:
-        batches: leaves [G, B, ...].
+        batches, noise: leaves [G, B, ...].
         how: the keywords of `update`.
     """
 
     def body(agent, xs):
-        batch, key = xs
-        return update(agent, batch, hyper, key, **how), None
+        return update(agent, *xs, hyper, **how), None
 
-    count = batches.reward.shape[0]
-    return jax.lax.scan(body, agent, (batches, jax.random.split(key, count)))[0]
+    return jax.lax.scan(body, agent, (batches, noise))[0]

@@ -173,25 +173,29 @@ class PsMbpo(Algorithm):
 
     def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Agent:
         """The agents after G SAC updates of every member on λ D_E + (1 - λ) D_M^{n,m} (lines 11 and 12)."""
-        layout, nets = self.layout, sac.make_networks(self.settings, self.spec)
+        settings, layout, nets = self.settings, self.layout, sac.make_networks(self.settings, self.spec)
         batch_key, update_key = jax.random.split(key)
         ids = layout.member_ids()
-        ratios = self.real_ratios(counters, state)[ids % self.settings.n_members]  # of padding members, too
+        ratios = self.real_ratios(counters, state)[ids % settings.n_members]  # of padding members, too
         # Minibatches of all members are gathered at once and before the loop over members: looping over the rings
         # themselves would copy each of them whole.
         batches = jax.vmap(lambda imagined, ratio, key: self.minibatches(counters, state, imagined, ratio, key))(
             state.imagined, ratios, layout.keys(batch_key, ids)
         )
+        shape = (settings.updates_per_step, settings.policy_batch_size, self.spec.action_size)
+        noise = jax.vmap(partial(sac.Noise.draw, shape=shape))(layout.keys(update_key, ids))
+        batches, noise = layout.part((batches, noise), axis=2)
 
-        settings, moments = self.settings, state.moments
+        moments = state.moments
         limits = sac.Limits(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
 
-        def update(agent, batches, key, hyper, limits):
+        def update(agent, batches, noise, hyper, limits):
             every = settings.target_update_every
-            return sac.updates(agent, batches, hyper, key, nets=nets, limits=limits, target_every=every)
+            return sac.updates(
+                agent, batches, noise, hyper, nets=nets, limits=limits, target_every=every, mean=layout.mean_of_parts
+            )
 
-        keys = layout.keys(update_key, ids)
-        return layout.map_local(update, state.agents, batches, keys, shared=(state.hyper, limits))
+        return layout.map_local(update, state.agents, batches, noise, shared=(state.hyper, limits))
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings

@@ -48,8 +48,8 @@ class Trained:
 
     def actors(self) -> Any:
         """Parameters of every member's policy, leaves [N·M, ...]."""
-        count = self.run.settings.n_members
-        return jax.tree.map(lambda x: x[:count], self.of_lane(self.state.agents.actor))
+        places = self.algorithm.layout.places_of_members
+        return jax.tree.map(lambda x: x[places], self.of_lane(self.state.agents.actor))
 
     def best(self) -> int:
         """The member that has earned the most."""

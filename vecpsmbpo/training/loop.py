@@ -169,7 +169,6 @@ class _Session:
             report.keep(self.run_dir, _warn)
 
     def _lines(self, returns: Returns, seconds: float) -> list[metrics.Line]:
-        settings = self.settings
         rates = Rates.over(self.driver.algorithm, self.env_steps, self.epoch_steps_done, seconds)
         return [
             {
@@ -182,15 +181,18 @@ class _Session:
                 "compile_seconds": self.driver.compile_seconds,
                 "seconds": self.watch(),
             }
-            for index, line in enumerate(metrics.epoch_lines(self.state, settings))
+            for index, line in enumerate(self._epoch_lines())
         ]
+
+    def _epoch_lines(self) -> list[metrics.Line]:
+        return metrics.epoch_lines(self.driver.layout.unpad(self.state.without_rings()), self.settings)
 
     def _note_frozen(self) -> None:
         """Says and writes which lanes were frozen in the chunk that ended."""
         before, self.frozen = self.frozen, np.asarray(health.frozen(self.state.seeds.health))
         new = np.flatnonzero(self.frozen & ~before).tolist()
         if new:
-            lines = metrics.epoch_lines(self.state, self.settings)
+            lines = self._epoch_lines()
             self.log.metrics(sorted((self._last_line(lines[lane], lane) for lane in new), key=lambda x: x["env_steps"]))
         for lane in new:
             self.display.say(self._frozen_words(lane))
