@@ -107,19 +107,22 @@ def predict_with_any(
 ) -> dynamics.Successor:
     """For every row a model drawn anew, as in MBPO and in TS1 of PETS.
 
-    Every model predicts every row and one answer is kept: what a model costs is little beside the updates, and no row
-    has to be moved.
+    Rows are shuffled and cut into N parts: each row's model is uniform, whatever it was a step before, and a row costs
+    one model and not N.
 
     Args:
         predict: of one model.
         models: leaves [N, ...].
+        obs, action: [B, O], [B, A].
     """
-    key, which_key = jax.random.split(key)
-    count = models.loss.shape[0]
-    answers = jax.vmap(predict, in_axes=(0, None, None, 0))(models, obs, action, jax.random.split(key, count))
-    rows = jnp.arange(obs.shape[0])
-    which = jax.random.randint(which_key, rows.shape, 0, count)
-    return jax.tree.map(lambda x: x[which, rows], answers)
+    key, shuffle_key = jax.random.split(key)
+    count, rows = models.loss.shape[0], obs.shape[0]
+    part = -(-rows // count)
+    # The last part is filled up with rows that are predicted twice; the first prediction counts.
+    order = jnp.resize(jax.random.permutation(shuffle_key, rows), (count, part))
+    place = jnp.argsort(order.reshape(-1)[:rows])
+    answers = jax.vmap(predict)(models, obs[order], action[order], jax.random.split(key, count))
+    return jax.tree.map(lambda x: x.reshape(count * part, *x.shape[2:])[place], answers)
 
 
 def start_states(real: jax.Array, rows: jax.Array, key: jax.Array, count: int, spec: EnvSpec) -> jax.Array:
