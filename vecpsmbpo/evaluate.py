@@ -1,6 +1,7 @@
 """`vecpsmbpo eval`: whole episodes of a trained run's policies."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from vecpsmbpo.drivers import Driver
 from vecpsmbpo.drivers.common import evaluation_policies
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.train import evaluation_keys, initial_inputs, make_driver
+from vecpsmbpo.types import TrainState
 
 
 def evaluate(stored: Settings, settings: Settings) -> int:
@@ -52,15 +54,46 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
     Raises:
         SettingError: the run holds no checkpoint, or there is not enough memory for it.
     """
+    with _opened(stored) as (driver, shapes, checkpoints):
+        saved = checkpoints.restore(shapes, driver.layout, warn=_warn)
+    if saved is None:
+        raise SettingError(f"run_dir={stored.run_dir}: holds no checkpoint yet")
+    return driver, saved
+
+
+def restore_each(stored: Settings) -> Iterator[tuple[Driver, checkpoint.Saved]]:
+    """As `restore`, of every checkpoint that is kept and can be read, oldest first and one at a time.
+
+    Raises:
+        SettingError: there is not enough memory.
+    """
+    with _opened(stored) as (driver, shapes, checkpoints):
+        for step in checkpoints.steps():
+            try:
+                saved = checkpoints.restore(shapes, driver.layout, warn=lambda text: None, at=step)
+            except SettingError as error:
+                _warn(str(error))
+            else:
+                assert saved is not None
+                yield driver, saved
+                del saved  # before the next is read: one state is all there may be room for
+
+
+@contextlib.contextmanager
+def _opened(stored: Settings) -> Iterator[tuple[Driver, TrainState, checkpoint.Checkpoints]]:
+    """A run's driver, the shapes of its state, and its checkpoints to be read."""
     driver = make_driver(stored)
     shapes = driver.shapes(*initial_inputs(stored))
     resources.check_memory(stored, driver.algorithm.spec, driver.layout, shapes)
     checkpoints = checkpoint.Checkpoints(Path(stored.run_dir) / "checkpoints", read_only=True)
-    saved = checkpoints.restore(shapes, driver.layout, warn=lambda text: Console(stderr=True).print(text))
-    checkpoints.close()
-    if saved is None:
-        raise SettingError(f"run_dir={stored.run_dir}: holds no checkpoint yet")
-    return driver, saved
+    try:
+        yield driver, shapes, checkpoints
+    finally:
+        checkpoints.close()
+
+
+def _warn(text: str) -> None:
+    Console(stderr=True).print(text)
 
 
 def load_policy(run_dir: str | Path) -> tuple[Settings, Callable[[jax.Array], jax.Array]]:

@@ -54,6 +54,7 @@ class Settings:
     eval_policy: str = _choice("posterior", "best", "average")
     eval_actions: str = _choice("mean", "sampled")
     checkpoint_every: int = _whole(1)
+    keep_checkpoints: int = _whole(1)
     report: bool
     devices: int = _whole(0)
     compile_cache: bool
@@ -218,7 +219,7 @@ TRACED = (
 # Settings that a resumed run may change: they steer the loop around the run, not what it computes.
 CHANGEABLE = frozenset(
     {"total_steps", "eval_episodes", "eval_policy", "eval_actions", "checkpoint_every", "report", "devices"}
-    | {"compile_cache"}
+    | {"keep_checkpoints", "compile_cache"}
 )
 
 

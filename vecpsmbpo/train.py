@@ -103,7 +103,7 @@ class _Run:
     def __init__(self, settings: Settings, driver: Driver, shapes: TrainState, memory: str):
         self.settings, self.driver = settings, driver
         self.run_dir = Path(settings.run_dir)
-        self.checkpoints = checkpoint.Checkpoints(self.run_dir / "checkpoints")
+        self.checkpoints = checkpoint.Checkpoints(self.run_dir / "checkpoints", keep=settings.keep_checkpoints)
         saved = self.checkpoints.restore(shapes, driver.layout, warn=_warn)
         self.state = saved.state if saved else driver.init(*initial_inputs(settings))
         self.saved_step = saved.step if saved else None

@@ -126,6 +126,14 @@ def load(path: Path) -> Run:
         raise SettingError(f"run_dir={path}: cannot be read ({error.strerror})") from None
 
 
+def check_lane(run: Run, lane: int) -> None:
+    """Raises:
+    SettingError: the run has no such lane.
+    """
+    if lane >= len(run.settings.lanes):
+        raise SettingError(f"lane={lane}: must be below {len(run.settings.lanes)}, the lanes of {run.path}")
+
+
 def load_all(paths: Iterable[Path]) -> list[Run]:
     """The runs in directories, each with an epoch to show.
 
