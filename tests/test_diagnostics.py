@@ -1,7 +1,5 @@
 """Measures of models and critics, on worlds whose answers are known by hand."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +7,8 @@ import pytest
 from scipy.stats import norm
 
 from tests import probes
-from tests.helpers import command, tiny
-from vecpsmbpo import cli, networks, sac
+from tests.helpers import tiny
+from vecpsmbpo import networks, sac
 from vecpsmbpo.envs.termination import never
 from vecpsmbpo.look import diagnostics, fresh
 from vecpsmbpo.types import EnvSpec, Model, Scaling
@@ -216,7 +214,7 @@ def test_a_step_that_is_not_finite_ends_an_episode_before_it():
 def test_imagined_states_far_from_real_ones_are_far():
     random = np.random.default_rng(0)
     known, fresh_ones = random.normal(size=(2, 4000, 2)) * [1.0, 100.0]
-    found = diagnostics.nearness(known, known[:50] + [3 * known[:, 0].std(), 0], fresh_ones)
+    found = diagnostics.nearness(known, known[:50] + 3 * np.array([known[:, 0].std(), 0]), fresh_ones)
     assert found.fresh < 0.05
     assert found.imagined > 5 * found.fresh
     assert diagnostics.nearness(known, known[:50], fresh_ones).imagined == 0

@@ -1,5 +1,6 @@
 """What is made of a checkpoint: videos, exported policies, diagnostics. One tiny run serves all tests."""
 
+import collections
 import json
 import shutil
 import subprocess
@@ -13,9 +14,9 @@ from PIL import Image
 
 from tests import looks
 from tests.helpers import command
-from vecpsmbpo import cli
+from vecpsmbpo import cli, config, train
 from vecpsmbpo.evaluate import load_policy
-from vecpsmbpo.look import members, render, runs
+from vecpsmbpo.look import diagnose, members, render, runs, stage, states
 
 # What rendering needs of the machine; without it (a bare container) the tests of pictures have nothing to test.
 try:
@@ -31,6 +32,7 @@ def trained(tmp_path_factory):
     """N = M = 2 on the original cartpole; its first seed."""
     folder = tmp_path_factory.mktemp("trained")
     words = ["env=cartpole_swingup", "backend=host", "size=tiny", "total_steps=80", "report=true", "num_seeds=2"]
+    words += ["keep_checkpoints=3"]
     result = command("train", *words, "run_dir=run", cwd=folder)
     assert result.returncode == 0, result.stderr
     return folder / "run"
@@ -84,6 +86,46 @@ def test_an_exported_policy_acts_the_same_without_this_package(trained, tmp_path
     assert (out / "policy.npz").read_bytes() == before
 
 
+# ── diagnostics ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_run_is_diagnosed_and_its_report_says_so(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(states, "has_umap", lambda: False)  # its compilation takes half a minute
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    assert cli.main(["diagnose", str(run), "horizon=4", "lane=1"]) == 0
+    found = json.loads((run / "diagnostics.json").read_text())
+    assert (found["env_steps"], found["lane"]) == (80, {"seed": 1})
+    assert [point["env_steps"] for point in found["history"]] == [0, 40, 80]  # keep_checkpoints=3
+    assert [point["errors"] is None for point in found["history"]] == [True, True, False]  # fitted after the warm-up
+    models = found["models"]
+    assert np.shape(models["error"]) == np.shape(models["expected"]) == (2, 4, 6)
+    assert np.shape(models["coverage"]) == (2, 3, 6)
+    assert found["critics"]["members"] == ["0,0", "0,1", "1,0", "1,1"]
+    assert found["critics"]["states"] == 4 * 25  # what lies beyond the time limit is seen, too
+    difference = found["critics"]["q"] - found["critics"]["earned"]
+    assert found["critics"]["bias"] == pytest.approx(difference, abs=1e-3)
+    assert found["states"]["method"] == "principal components"
+    assert cli.main(["report", str(run), f"out={tmp_path / 'r.html'}"]) == 0
+    page = (tmp_path / "r.html").read_text()
+    assert "put to the test" in page
+    assert "error of the reward" in page
+
+
+@pytest.mark.parametrize("algo", ["mbpo", "pets"])
+def test_other_algorithms_are_diagnosed(algo, tmp_path, monkeypatch):
+    monkeypatch.setattr(states, "has_umap", lambda: False)
+    words = ["env=cartpole_swingup", "backend=host", "size=tiny", "total_steps=80", f"algo={algo}"]
+    settings = config.compose([*words, f"run_dir={tmp_path / 'run'}"])
+    assert train.train(settings) == 0
+    out = tmp_path / "a.png"
+    assert cli.main(["diagnose", str(tmp_path / "run"), "horizon=4", f"out={out}"]) == 0
+    assert Image.open(out).size[0] > 800
+    found = diagnose.measure(runs.load(tmp_path / "run"), horizon=4)
+    assert found["models"] is not None
+    assert (found["critics"] is None) == (found["states"] is None) == (algo == "pets")  # it has no policies
+
+
 # ── videos ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -104,6 +146,48 @@ def test_render_draws_every_member_and_the_robot_moves(trained, tmp_path):
 def _seek(film, index):
     film.seek(index)
     return film
+
+
+@draws
+def test_render_draws_a_member_at_steps_of_training(trained, tmp_path):
+    words = ["steps=[0,80]", "member=1,0", "length=12", "width=80", f"out={tmp_path / 'a.png'}"]
+    result = command("render", str(trained), *words, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"), float)
+    assert picture.shape == (2 * 60, 4 * 80, 3)  # a row for each step, four frames in it
+    first, last = np.split(picture, 2)
+    assert np.abs(first[20:] - last[20:]).max() > 50  # another policy moves it elsewhere
+
+
+@draws
+@pytest.mark.parametrize("kind", ["port", "brax", "playground"])
+def test_jax_environments_are_drawn(kind, monkeypatch):
+    """What moves in the simulator moves in the picture."""
+    monkeypatch.setenv("MUJOCO_GL", render.platform())
+    from vecpsmbpo import envs
+
+    if kind == "port":
+        env, positions = envs.make("cartpole_swingup", "mjx"), ([0.0, 0.0], [0.5, 2.0])
+    elif kind == "brax":
+        env, positions = envs.make("brax", "mjx", id="reacher"), ([0.0, 0.0, 0.1, 0.1], [1.0, 1.0, 0.1, 0.1])
+    else:  # the package is an extra; of its environments only these names are used
+        model = envs.make("cartpole_swingup", "mjx").model
+        env = types.SimpleNamespace(inner=types.SimpleNamespace(mj_model=model, dt=0.01), _action_repeat=2)
+        positions = ([0.0, 0.0], [0.5, 2.0])
+    scene = stage.scene(env)
+    draw = [stage._draw(scene, *stage._renderer(scene.model, 80), _state(kind, qpos)) for qpos in positions]
+    assert draw[0].std() > 5
+    assert np.abs(draw[0].astype(float) - draw[1]).max() > 50
+    assert scene.dt == {"port": 0.01, "brax": 0.02, "playground": 0.02}[kind]
+
+
+def _state(kind, qpos):
+    """A state of one environment as that library keeps it, [1, ...]."""
+    inside = {"port": ("qpos",), "brax": ("pipeline_state", "q"), "playground": ("data", "qpos")}[kind]
+    value = np.array([qpos])
+    for name in reversed(("pipeline_state", *inside)):
+        value = collections.namedtuple("State", [name])(value)
+    return value
 
 
 @draws
@@ -135,7 +219,7 @@ def test_a_mosaic_has_its_tiles_in_rows():
 def test_an_environment_that_can_draw_itself_does():
     picture = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
     env = types.SimpleNamespace(render_mode="rgb_array", render=lambda: picture, unwrapped=types.SimpleNamespace())
-    np.testing.assert_array_equal(render.camera(types.SimpleNamespace(env=env), 64)(), picture)
+    np.testing.assert_array_equal(stage.camera(types.SimpleNamespace(env=env), 64)(), picture)
 
 
 MISTAKES = [
@@ -148,7 +232,19 @@ MISTAKES = [
     (["export", "run", "out=file"], "out=file: must be a directory"),
     (["export", "pets"], "run_dir=pets: only policies that learn by SAC can be exported, not algo=pets"),
     (["export", "bare"], "run_dir=bare: holds no checkpoint yet"),
-    (["render", "brax"], "render: env=brax has no simulator on the host that could draw it"),
+    (["diagnose", "run", "run2"], "run_dir: diagnose takes 1 run, not 2"),
+    (["diagnose", "run", "out=a.gif"], "out=a.gif: must be a file that ends in .json, .png, .svg, .pdf"),
+    (["diagnose", "run", "out=a.json", "lane=2"], "lane=2: must be below 2"),
+    (["diagnose", "run", "out=file/a.json"], "out=file/a.json: cannot be written (Not a directory)"),
+    (["diagnose", "bare"], "run_dir=bare: holds no checkpoint that can be read"),
+    (
+        ["report", "half", "out=a.html"],
+        "half/diagnostics.json: cannot be read; vecpsmbpo diagnose half writes it again",
+    ),
+    (["render", "run", "out=a.gif", "steps=41"], "steps=41: must be of 0, 40, 80, which checkpoints are kept of"),
+    (["render", "run", "out=a.gif", "steps=[0,x]"], "steps=[0,x]: must be whole numbers, separated by commas"),
+    (["render", "run", "out=a.gif", "steps=0,40", "member=all"], "member=all: with steps= there is room for one"),
+    (["export", "run", "data=rlds"], "data=rlds: must be one of none, minari"),
 ]
 
 
@@ -160,7 +256,8 @@ def shelf(trained, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     looks.write(tmp_path / "pets", looks.epochs([1]), algo="pets")
     looks.write(tmp_path / "bare", looks.epochs([1]), backend="host")
-    looks.write(tmp_path / "brax", looks.epochs([1]), **{"env": "brax", "env.id": "reacher"})
+    looks.write(tmp_path / "half", looks.epochs([1]))
+    (tmp_path / "half" / "diagnostics.json").write_text('{"history": [')
     return tmp_path
 
 

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from vecpsmbpo import crash
+from vecpsmbpo import crash, loggers
 from vecpsmbpo.settings import SettingError, Settings
 
 HELP = """\
@@ -91,6 +91,7 @@ def _train(overrides: list[str]) -> int:
 
 
 def _run(settings: Settings) -> int:
+    loggers.check(settings.loggers)
     from vecpsmbpo.train import DiskError, train
 
     try:

@@ -1,7 +1,7 @@
 """`vecpsmbpo eval`: whole episodes of a trained run's policies."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -61,14 +61,17 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
     return driver, saved
 
 
-def restore_each(stored: Settings) -> Iterator[tuple[Driver, checkpoint.Saved]]:
-    """As `restore`, of every checkpoint that is kept and can be read, oldest first and one at a time.
+def restore_each(stored: Settings, steps: Collection[int] = ()) -> Iterator[tuple[Driver, checkpoint.Saved]]:
+    """As `restore`, of every checkpoint that is kept and can be read, or of those at `steps`; oldest first and one at a
+    time.
 
     Raises:
         SettingError: there is not enough memory.
     """
     with _opened(stored) as (driver, shapes, checkpoints):
         for step in checkpoints.steps():
+            if steps and step not in steps:
+                continue
             try:
                 saved = checkpoints.restore(shapes, driver.layout, warn=lambda text: None, at=step)
             except SettingError as error:

@@ -112,7 +112,7 @@ class _Run:
             driver.load_env(saved.host["env"])
         self.env_steps = saved.step if saved else 0
         self.frozen = np.asarray(health.frozen(self.state.seeds.health))
-        self.log = metrics.RunLog(self.run_dir, self.env_steps, settings.lanes[0])
+        self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn)
         self.display = Display(driver.algorithm, self.env_steps)
         self.memory = memory
         self.epoch_began = time.perf_counter()

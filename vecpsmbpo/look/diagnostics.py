@@ -1,7 +1,7 @@
 """What a checkpoint's models and critics are worth: measures of one model, one critic, some episodes.
 
-Axes: N models, W windows (a start in a fresh episode and what followed), H steps ahead, O observation, A action, D = O + 1
-what a model predicts (the next observation's coordinates and the reward), E episodes, T steps, P members.
+Axes: N models, W windows (a start in a fresh episode and what followed), H steps ahead, O observation, A action, D =
+O + 1 what a model predicts (the next observation and the reward), E episodes, T steps, P members.
 """
 
 from functools import partial
@@ -45,7 +45,9 @@ class Windows(NamedTuple):
 
     def until(self, horizon: int) -> "Windows":
         """The first `horizon` steps ahead."""
-        return self._replace(action=self.action[:, :horizon], truth=self.truth[:, :horizon], there=self.there[:, :horizon])
+        return self._replace(
+            action=self.action[:, :horizon], truth=self.truth[:, :horizon], there=self.there[:, :horizon]
+        )
 
 
 def windows(episodes: Episodes, horizon: int, length: int, random: np.random.Generator) -> Windows:
@@ -117,9 +119,7 @@ def errors(mean: Array, variance: Array, seen: Windows) -> Errors:
         steady[..., :-1] = seen.obs[:, None]
         between = mean.var(axis=0, ddof=1) - noise.mean(axis=0) if len(mean) > 1 else np.full(mean.shape[1:], np.nan)
         root = lambda values: np.sqrt(np.maximum(_mean(values, seen.there), 0.0))  # noqa: E731
-        return Errors(
-            root(squares), root(variance.astype(float)), root((seen.truth - steady) ** 2), root(between)
-        )
+        return Errors(root(squares), root(variance.astype(float)), root((seen.truth - steady) ** 2), root(between))
 
 
 def relative(values: Array, spread: Array) -> Array:
@@ -169,7 +169,7 @@ def calibration(surprises: Array) -> Calibration:
     """Of surprises [N, B, D]."""
     bounds = norm.ppf(0.5 + np.array(LEVELS) / 2)
     coverage = (np.abs(surprises)[:, None] <= bounds[:, None, None]).mean(axis=2)
-    places = norm.cdf(surprises).reshape(len(surprises), -1)
+    places: Any = norm.cdf(surprises).reshape(len(surprises), -1)
     counts = [np.histogram(one, bins=BINS, range=(0, 1))[0] for one in places]
     return Calibration(coverage, np.stack(counts) * BINS / places.shape[1])
 
@@ -191,8 +191,8 @@ def returns(episodes: Episodes, discount: float, alpha: Array) -> Array:
         alpha: [E], of each episode's member; 0 gives the plain discounted return.
     """
     following = np.zeros(len(episodes.reward))
-    found = np.zeros(episodes.reward.shape)
-    for t in reversed(range(found.shape[1])):
+    found = np.zeros_like(episodes.reward, float)
+    for t in reversed(range(episodes.reward.shape[1])):
         found[:, t] = episodes.reward[:, t] + discount * ~episodes.terminated[:, t] * following
         following = (found[:, t] - alpha * episodes.log_prob[:, t]) * episodes.there[:, t]
     return found
@@ -200,10 +200,9 @@ def returns(episodes: Episodes, discount: float, alpha: Array) -> Array:
 
 def told(episodes: Episodes, discount: float) -> Array:
     """[E, T] bool: where enough of what followed was seen to know the return, all of it or all but `TAIL`."""
-    steps = episodes.there.shape[1]
     left = episodes.there[:, ::-1].cumsum(axis=1)[:, ::-1]
     whole = episodes.terminated.any(axis=1, keepdims=True)
-    return episodes.there & (whole | (discount ** np.minimum(left, steps) <= TAIL))
+    return episodes.there & (whole | (discount**left <= TAIL))
 
 
 @partial(jax.jit, static_argnames="nets")

@@ -16,7 +16,7 @@ Array = np.ndarray
 
 COLUMNS = 3  # pictures in a row of a sheet
 PANEL = (4.4, 3.2)
-GREY = {"color": style.FAINT, "lw": 1.2}
+GREY: Any = {"color": style.FAINT, "lw": 1.2}
 
 
 class Panel(NamedTuple):
@@ -88,9 +88,11 @@ def _model_panels(models: dict[str, Any]) -> Iterator[Panel]:
         "another; and what knows nothing, that nothing changes",
         lambda axes: _draw_errors(axes, relative, "error, in standard deviations"),
     )
-    yield Panel("error of the reward", "the same of the reward of each step, in its own unit", lambda axes: _draw_errors(
-        axes, reward, "error of the reward"
-    ))  # fmt: skip
+    yield Panel(
+        "error of the reward",
+        "the same of the reward of each step, in its own unit",
+        lambda axes: _draw_errors(axes, reward, "error of the reward"),
+    )
     yield Panel(
         "error by dimension",
         "the error of every coordinate of the observation and of the reward, in its standard deviations; mean over "
@@ -135,7 +137,7 @@ def _draw_errors(axes: Axes, found: dict[str, Array], label: str) -> None:
 def _draw_dimensions(axes: Axes, models: dict[str, Any]) -> None:
     spread = _array(models["spread"])
     errors = _array(models["error"]).mean(axis=0) / np.where(spread > 0, spread, np.nan)
-    names = [f"reward" if name == "reward" else name for name in models["dimensions"]]
+    names = models["dimensions"]
     scale = LogNorm(0.01, 1, clip=True)
     edges = np.arange(errors.shape[0] + 1) + 0.5
     rows = np.arange(len(names) + 1) - 0.5
@@ -155,7 +157,7 @@ def _draw_calibration(axes: Axes, models: dict[str, Any]) -> None:
     edges = np.linspace(0, 1, histogram.shape[1] + 1)
     for index, look in enumerate(style.looks(len(histogram))):
         axes.stairs(histogram[index], edges, color=look.colour, lw=1.4, label=f"model {index}")
-    axes.axhline(1, label="right", **GREY)
+    axes.axhline(1, label="were it right", **GREY)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("place in the predicted distribution")
     axes.set_ylabel("density of what happened")
@@ -168,9 +170,9 @@ def _draw_calibration(axes: Axes, models: dict[str, Any]) -> None:
 def _critic_panel(critics: dict[str, Any]) -> Panel:
     caption = (
         f"what critics promised, min(Q₁, Q₂), and what was earned from the same states on, discounted by "
-        f"{critics['discount']:g} and with the entropy bonus: Q is {critics['q']:.4g}, the return {critics['earned']:.4g}"
-        f", on average over {critics['states']:,} states (the difference {critics['bias']:+.3g} ± "
-        f"{critics['spread_of_bias']:.3g}); a colour for each member"
+        f"{critics['discount']:g} and with the entropy bonus: Q is {critics['q']:.4g}, the return "
+        f"{critics['earned']:.4g}, on average over {critics['states']:,} states (the difference "
+        f"{critics['bias']:+.3g} ± {critics['spread_of_bias']:.3g}); a colour for each member"
     )
     return Panel("Q against the return", caption, lambda axes: _draw_critics(axes, critics))
 

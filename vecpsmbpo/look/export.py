@@ -2,8 +2,12 @@
 
 policy.npz    the weights, as NumPy reads them
 act.py        the policy in NumPy alone, with the weights beside it
-policy.jax    the same as a compiled function for any machine (`jax.export`); needs JAX alone
+policy.jax    the same as a function for CPUs, GPUs and TPUs (StableHLO, by `jax.export`), which needs JAX alone
 policy.json   which task, run, member and step it is of
+minari/       with data=minari: the real data, as a Minari data set
+
+There is no ONNX: no kept converter from JAX runs on all Pythons that this package is for. What act.py does is five
+lines.
 """
 
 import functools
@@ -11,20 +15,25 @@ import json
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vecpsmbpo.look import arguments, files, runs
+from vecpsmbpo.look import arguments, dataset, files, runs
 from vecpsmbpo.settings import SettingError
+
+if TYPE_CHECKING:
+    from vecpsmbpo.look.members import Trained
 
 OPTIONS = {
     "member": arguments.text("best", "best or n,m"),
     "lane": arguments.whole(0),
+    "data": arguments.choice("none", "minari"),
     "out": arguments.out("policy"),
 }
 
-FILES = ("policy.npz", "act.py", "policy.json")
+FILES = ("policy.npz", "act.py", "policy.jax", "policy.json")
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 ACT = '''\
 """A policy that vecpsmbpo has trained, in NumPy alone: obs [..., O] -> action [..., A] in [-1, 1]."""
 
@@ -61,45 +70,54 @@ def run(words: Sequence[str]) -> int:
     if out.exists() and not out.is_dir():
         raise SettingError(f"out={out}: must be a directory")
     files.check_writable(out / "policy.npz")
+    if options["data"] == "minari":
+        dataset.check_minari()
     found = runs.load(path)
+    runs.check_lane(found, options["lane"])
     if found.settings.plans or found.settings.alternates:
         raise SettingError(
             f"run_dir={path}: only policies that learn by SAC can be exported, not algo={found.settings.algo}"
         )
-    export(found, out, options["member"], options["lane"])
-    print(f"written: {', '.join(str(out / name) for name in FILES)}")
+    from vecpsmbpo.look import members
+
+    trained = members.load(found, options["lane"])
+    export(trained, out, options["member"])
+    written = [out / name for name in FILES]
+    if options["data"] == "minari":
+        written.append(dataset.write(trained, out / "minari"))
+    print(f"written: {', '.join(map(str, written))}")
     return 0
 
 
-def export(run: runs.Run, out: Path, member: str, lane: int) -> None:
-    """Writes the files into the directory `out`.
+def export(trained: "Trained", out: Path, member: str) -> None:
+    """Writes the policy's files into the directory `out`.
 
     Raises:
-        SettingError: as `members.load`; there is no such member.
+        SettingError: there is no such member, or they cannot be written.
     """
     import jax
 
     from vecpsmbpo.look import members
 
-    trained = members.load(run, lane)
-    index = _index(trained, member)
+    run, index = trained.run, _index(trained, member)
     layers = weights(jax.tree.map(lambda x: np.asarray(x[index]), trained.actors()), trained.algorithm.spec.action_size)
     about = {
         "task": run.settings.task,
         "run": run.name,
         "algo": run.settings.algo,
         "env_steps": trained.step,
-        **run.settings.lanes[lane],
+        **run.settings.lanes[trained.index],
         "member": members.member_names(run)[index],
         "obs_size": trained.algorithm.spec.obs_size,
         "action_size": trained.algorithm.spec.action_size,
     }
     files.write(out / "policy.npz", functools.partial(_save, layers))
     files.write_text(out / "act.py", ACT)
+    files.write(out / "policy.jax", lambda path: path.write_bytes(function(layers)))
     files.write_text(out / "policy.json", json.dumps(about, indent=2) + "\n")
 
 
-def _index(trained: Any, member: str) -> int:
+def _index(trained: "Trained", member: str) -> int:
     """n·M + m of the member.
 
     Raises:
@@ -126,6 +144,26 @@ def weights(actor: Any, action_size: int) -> dict[str, np.ndarray]:
         found[f"kernel_{index}"] = kernel[:, :action_size] if last else kernel
         found[f"bias_{index}"] = bias[:action_size] if last else bias
     return found
+
+
+def function(layers: dict[str, np.ndarray]) -> bytes:
+    """obs [b, O] -> action [b, A] of `weights`, for any b, as `jax.export.deserialize(...).call` takes it."""
+    import jax
+    import jax.numpy as jnp
+    from jax import export
+
+    count = len(layers) // 2
+
+    def act(obs: Any) -> Any:
+        hidden = obs
+        for index in range(count):
+            hidden = hidden @ layers[f"kernel_{index}"] + layers[f"bias_{index}"]
+            hidden = jnp.maximum(hidden, 0) if index < count - 1 else jnp.tanh(hidden)
+        return hidden
+
+    shape = (*export.symbolic_shape("b"), layers["kernel_0"].shape[0])
+    exported = export.export(jax.jit(act), platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, jnp.float32))
+    return bytes(exported.serialize())
 
 
 def _save(layers: dict[str, np.ndarray], path: Path) -> None:

@@ -62,15 +62,15 @@ class MjxWorld:
     def __init__(self, env: Any, count: int, seed: int):
         self._keys = jax.random.split(jax.random.key(seed), count)
         self._reset, self._step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
-        self._state: Any = None
+        self.state: Any = None  # leaves [E, ...]
 
     def reset(self) -> Array:
-        self._state = self._reset(self._keys)
-        return np.asarray(self._state.obs)
+        self.state = self._reset(self._keys)
+        return np.asarray(self.state.obs)
 
     def step(self, action: Array) -> Step:
-        self._state = self._step(self._state, action)
-        obs, reward, done = (np.asarray(x) for x in (self._state.obs, self._state.reward, self._state.done))
+        self.state = self._step(self.state, action)
+        obs, reward, done = (np.asarray(x) for x in (self.state.obs, self.state.reward, self.state.done))
         return Step(obs, reward, done > 0, np.zeros(len(done), bool), obs)
 
 

@@ -1,6 +1,6 @@
 """What a checkpoint holds of one lane: its policies and models, outside of the program that trained them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -103,8 +103,8 @@ def load(run: Run, lane: int = 0) -> Trained:
     return _trained(run, driver.algorithm, saved, lane)
 
 
-def load_each(run: Run, lane: int = 0) -> Iterator[Trained]:
-    """As `load`, of every checkpoint that is kept and can be read, oldest first.
+def load_each(run: Run, lane: int = 0, steps: Collection[int] = ()) -> Iterator[Trained]:
+    """As `load`, of every checkpoint that is kept and can be read, or of those at `steps`; oldest first.
 
     Raises:
         SettingError: there is none, or no such lane.
@@ -112,7 +112,7 @@ def load_each(run: Run, lane: int = 0) -> Iterator[Trained]:
     check_lane(run, lane)
     runtime.configure(run.settings)
     found = False
-    for driver, saved in restore_each(run.settings):
+    for driver, saved in restore_each(run.settings, steps):
         found = True
         yield _trained(run, driver.algorithm, saved, lane)
         del saved  # as in `restore_each`
