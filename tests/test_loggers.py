@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import os
+import struct
 import threading
+import time
 
 import pytest
 
@@ -167,25 +169,46 @@ def _two_sessions(name, folder, monkeypatch):
     return run_dir
 
 
+def _records(path):
+    """What W&B keeps in a file: LevelDB's log format, blocks of 32 KiB whose records may be in parts, after 7 bytes."""
+    data, place, parts = path.read_bytes(), 7, b""
+    while place + 7 <= len(data):
+        left = 32768 - place % 32768
+        if left < 7:
+            place += left
+            continue
+        size, kind = struct.unpack("<HB", data[place + 4 : place + 7])
+        parts += data[place + 7 : place + 7 + size]
+        place += 7 + size
+        if kind in (1, 4):  # whole, or the last part
+            yield parts
+            parts = b""
+
+
+def _whole(path, kind):
+    """The records of a session that has ended: its last one may come a moment after the end."""
+    for _ in range(100):
+        records = [kind.FromString(data) for data in _records(path)]
+        if records and records[-1].WhichOneof("record_type") == "exit":
+            return records
+        time.sleep(0.1)
+    raise AssertionError(f"{path} has no end")
+
+
 def test_weights_and_biases_offline(tmp_path, monkeypatch):
     pytest.importorskip("wandb")
     from wandb.proto import wandb_internal_pb2
-    from wandb.sdk.internal.datastore import DataStore
 
     monkeypatch.setenv("WANDB_MODE", "offline")
     run_dir = _two_sessions("wandb", tmp_path, monkeypatch)
     (name,) = {path.name for path in run_dir.glob("wandb/*/run-*.wandb")}
     assert name == f"run-{(run_dir / 'wandb.id').read_text()}.wandb"
     history, hyperparameters, files = {}, {}, set()
-    for path in sorted(run_dir.glob(f"wandb/*/{name}")):
-        store = DataStore()
-        store.open_for_scan(str(path))
-        while (data := store.scan_data()) is not None:
-            record = wandb_internal_pb2.Record()
-            record.ParseFromString(data)
+    for path in sorted(run_dir.glob(f"wandb/offline-run-*/{name}")):
+        for record in _whole(path, wandb_internal_pb2.Record):
             items = {item.key or ".".join(item.nested_key): item.value_json for item in record.history.item}
             if "epoch/return/seed0" in items:
-                step = json.loads(items["env_steps"])
+                step = json.loads(items["_step"])
                 assert step not in history
                 history[step] = json.loads(items["epoch/return/seed0"])
             hyperparameters |= {item.key: item.value_json for item in record.run.config.update}

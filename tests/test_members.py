@@ -14,9 +14,9 @@ from PIL import Image
 
 from tests import looks
 from tests.helpers import command
-from vecpsmbpo import cli, config, train
+from vecpsmbpo import cli, config, metrics, train
 from vecpsmbpo.evaluate import load_policy
-from vecpsmbpo.look import diagnose, members, render, runs, stage, states
+from vecpsmbpo.look import dataset, diagnose, members, render, runs, stage, states
 
 # What rendering needs of the machine; without it (a bare container) the tests of pictures have nothing to test.
 try:
@@ -74,6 +74,13 @@ def test_an_exported_policy_acts_the_same_without_this_package(trained, tmp_path
     )
     subprocess.run([sys.executable, "-c", code, str(out)], cwd=tmp_path, check=True)
     np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, atol=1e-5)
+    code = (
+        "import sys, numpy as np; from pathlib import Path; from jax import export; "
+        "act = export.deserialize(bytearray((Path(sys.argv[1]) / 'policy.jax').read_bytes())).call; "
+        "np.save('actions.npy', act(np.load('obs.npy'))); assert act(np.zeros((3, 5), 'f')).shape == (3, 1)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(out)], cwd=tmp_path, check=True)
+    np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, atol=1e-5)
     about = json.loads((out / "policy.json").read_text())
     assert (about["task"], about["env_steps"], about["obs_size"], about["action_size"]) == (
         "cartpole_swingup",
@@ -84,6 +91,32 @@ def test_an_exported_policy_acts_the_same_without_this_package(trained, tmp_path
     before = (out / "policy.npz").read_bytes()
     assert cli.main(["export", str(trained), f"out={out}", f"member={about['member']}"]) == 0
     assert (out / "policy.npz").read_bytes() == before
+
+
+def test_the_real_data_are_exported_as_minari_reads_them(trained, tmp_path, capsys):
+    minari = pytest.importorskip("minari")
+    out = tmp_path / "policy"
+    words = ["export", str(trained), "data=minari", "lane=1", f"out={out}"]
+    assert cli.main(words) == 0
+    data = minari.MinariDataset(out / "minari" / "vecpsmbpo" / "cartpole_swingup-v0" / "data")
+    lines = [line for line in metrics.read(trained / "episodes.jsonl") if line["seed"] == 1]
+    assert data.total_episodes == len(lines) == 3
+    for episode, line in zip(data.iterate_episodes(), lines, strict=True):
+        assert episode.rewards.sum() == pytest.approx(line["return"], abs=1e-4)
+        assert episode.observations.shape == (line["length"] + 1, 5)
+        assert (episode.terminations.sum(), episode.truncations.sum()) == (0, 1)
+        assert np.abs(episode.actions).max() <= 1
+    capsys.readouterr()
+    assert cli.main(words) == 2  # it is there already
+    assert capsys.readouterr().err.endswith("cartpole_swingup-v0: is there already\n")
+
+
+def test_a_data_set_without_its_extra_names_it(shelf, monkeypatch, capsys):
+    monkeypatch.setattr(dataset.importlib.util, "find_spec", lambda name: None)
+    assert cli.main(["export", "run", "data=minari"]) == 2
+    assert capsys.readouterr().err == (
+        "vecpsmbpo: data=minari: needs the package minari; pip install 'vecpsmbpo[minari]'\n"
+    )
 
 
 # ── diagnostics ───────────────────────────────────────────────────────────────────────────────────────────────────
@@ -112,18 +145,16 @@ def test_a_run_is_diagnosed_and_its_report_says_so(trained, tmp_path, monkeypatc
     assert "error of the reward" in page
 
 
-@pytest.mark.parametrize("algo", ["mbpo", "pets"])
-def test_other_algorithms_are_diagnosed(algo, tmp_path, monkeypatch):
-    monkeypatch.setattr(states, "has_umap", lambda: False)
-    words = ["env=cartpole_swingup", "backend=host", "size=tiny", "total_steps=80", f"algo={algo}"]
-    settings = config.compose([*words, f"run_dir={tmp_path / 'run'}"])
-    assert train.train(settings) == 0
+def test_plans_are_diagnosed_as_far_as_they_can_be(tmp_path):
+    """PETS has models, and neither critics nor imagined data."""
+    words = ["env=cartpole_swingup", "backend=host", "size=tiny", "total_steps=80", "algo=pets"]
+    assert train.train(config.compose([*words, f"run_dir={tmp_path / 'run'}"])) == 0
     out = tmp_path / "a.png"
     assert cli.main(["diagnose", str(tmp_path / "run"), "horizon=4", f"out={out}"]) == 0
     assert Image.open(out).size[0] > 800
     found = diagnose.measure(runs.load(tmp_path / "run"), horizon=4)
-    assert found["models"] is not None
-    assert (found["critics"] is None) == (found["states"] is None) == (algo == "pets")  # it has no policies
+    assert np.shape(found["models"]["error"]) == (2, 4, 6)
+    assert (found["critics"], found["states"]) == (None, None)
 
 
 # ── videos ────────────────────────────────────────────────────────────────────────────────────────────────────────

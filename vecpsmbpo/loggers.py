@@ -192,12 +192,12 @@ class Wandb:
             config=hyperparameters(settings),
             settings=wandb.Settings(silent=True, console="off", disable_git=True),
         )
-        # W&B's own step only rises; ours is a column.
-        self._run.define_metric("env_steps")
-        self._run.define_metric("*", step_metric="env_steps")
+        self._env_steps = 0
 
     def scalars(self, values: Values, env_steps: int) -> None:
-        self._run.log({**values, "env_steps": env_steps})
+        # W&B's steps only rise, over all sessions of a run; what belongs to one step is one row.
+        self._env_steps = max(self._env_steps, env_steps)
+        self._run.log(dict(values), step=self._env_steps)
 
     def flush(self) -> None:
         """It does so by itself."""
@@ -206,7 +206,7 @@ class Wandb:
         for path in paths:
             kind: Any = path.suffix[1:]
             shown = self._wandb.Html(str(path)) if kind == "html" else self._wandb.Video(str(path), format=kind)
-            self._run.log({path.stem: shown})
+            self._run.log({path.stem: shown}, step=self._env_steps)
 
     def close(self) -> None:
         self._run.finish()
