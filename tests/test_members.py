@@ -16,7 +16,7 @@ from tests import looks
 from tests.helpers import command
 from vecpsmbpo import cli, config, metrics, train
 from vecpsmbpo.evaluate import load_policy
-from vecpsmbpo.look import dataset, diagnose, members, render, runs, stage, states
+from vecpsmbpo.look import diagnose, export, members, render, runs, stage, states
 
 # What rendering needs of the machine; without it (a bare container) the tests of pictures have nothing to test.
 try:
@@ -96,7 +96,7 @@ def test_an_exported_policy_acts_the_same_without_this_package(trained, tmp_path
 def test_the_real_data_are_exported_as_minari_reads_them(trained, tmp_path, capsys):
     minari = pytest.importorskip("minari")
     out = tmp_path / "policy"
-    words = ["export", str(trained), "data=minari", "lane=1", f"out={out}"]
+    words = ["export", str(trained), "also=minari", "lane=1", f"out={out}"]
     assert cli.main(words) == 0
     data = minari.MinariDataset(out / "minari" / "vecpsmbpo" / "cartpole_swingup-v0" / "data")
     lines = [line for line in metrics.read(trained / "episodes.jsonl") if line["seed"] == 1]
@@ -111,12 +111,22 @@ def test_the_real_data_are_exported_as_minari_reads_them(trained, tmp_path, caps
     assert capsys.readouterr().err.endswith("cartpole_swingup-v0: is there already\n")
 
 
-def test_a_data_set_without_its_extra_names_it(shelf, monkeypatch, capsys):
-    monkeypatch.setattr(dataset.importlib.util, "find_spec", lambda name: None)
-    assert cli.main(["export", "run", "data=minari"]) == 2
-    assert capsys.readouterr().err == (
-        "vecpsmbpo: data=minari: needs the package minari; pip install 'vecpsmbpo[minari]'\n"
-    )
+@pytest.mark.parametrize("name", ["onnx", "minari"])
+def test_an_export_without_its_extra_names_it(name, shelf, monkeypatch, capsys):
+    monkeypatch.setattr(export.importlib.util, "find_spec", lambda name: None)
+    assert cli.main(["export", "run", f"also={name}"]) == 2
+    expected = f"vecpsmbpo: also={name}: needs the package {name}; pip install 'vecpsmbpo[{name}]'\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_an_onnx_policy_acts_the_same(trained, tmp_path):
+    pytest.importorskip("onnx")
+    from onnx.reference import ReferenceEvaluator
+
+    assert cli.main(["export", str(trained), "also=onnx", f"out={tmp_path}"]) == 0
+    obs = np.random.default_rng(0).normal(size=(7, 5)).astype(np.float32)
+    (action,) = ReferenceEvaluator(str(tmp_path / "policy.onnx")).run(None, {"obs": obs})
+    np.testing.assert_allclose(action, load_policy(trained)[1](obs), atol=1e-5)
 
 
 # ── diagnostics ───────────────────────────────────────────────────────────────────────────────────────────────────
@@ -275,7 +285,7 @@ MISTAKES = [
     (["render", "run", "out=a.gif", "steps=41"], "steps=41: must be of 0, 40, 80, which checkpoints are kept of"),
     (["render", "run", "out=a.gif", "steps=[0,x]"], "steps=[0,x]: must be whole numbers, separated by commas"),
     (["render", "run", "out=a.gif", "steps=0,40", "member=all"], "member=all: with steps= there is room for one"),
-    (["export", "run", "data=rlds"], "data=rlds: must be one of none, minari"),
+    (["export", "run", "also=rlds"], "also=rlds: must be of onnx, minari, separated by commas"),
 ]
 
 

@@ -1,7 +1,6 @@
 """The real data of a run, D_E, as a Minari data set: for other programs that learn from given data."""
 
 import contextlib
-import importlib.util
 import os
 import re
 import tempfile
@@ -17,16 +16,6 @@ if TYPE_CHECKING:
     from vecpsmbpo.look.members import Trained
 
 ROOT = "MINARI_DATASETS_PATH"  # where Minari keeps its data sets, an environment variable of its own
-
-
-def check_minari() -> None:
-    """Says so where the package is absent, before anything long begins.
-
-    Raises:
-        SettingError: it is.
-    """
-    if importlib.util.find_spec("minari") is None:
-        raise SettingError("data=minari: needs the package minari; pip install 'vecpsmbpo[minari]'")
 
 
 def write(trained: "Trained", folder: Path) -> Path:

@@ -4,13 +4,12 @@ policy.npz    the weights, as NumPy reads them
 act.py        the policy in NumPy alone, with the weights beside it
 policy.jax    the same as a function for CPUs, GPUs and TPUs (StableHLO, by `jax.export`), which needs JAX alone
 policy.json   which task, run, member and step it is of
-minari/       with data=minari: the real data, as a Minari data set
-
-There is no ONNX: no kept converter from JAX runs on all Pythons that this package is for. What act.py does is five
-lines.
+policy.onnx   with also=onnx: the same for ONNX's runtimes
+minari/       with also=minari: the real data, as a Minari data set
 """
 
 import functools
+import importlib.util
 import json
 import zipfile
 from collections.abc import Sequence
@@ -28,11 +27,12 @@ if TYPE_CHECKING:
 OPTIONS = {
     "member": arguments.text("best", "best or n,m"),
     "lane": arguments.whole(0),
-    "data": arguments.choice("none", "minari"),
+    "also": arguments.names(allowed="of onnx, minari, separated by commas"),
     "out": arguments.out("policy"),
 }
 
 FILES = ("policy.npz", "act.py", "policy.jax", "policy.json")
+OPSET, IR_VERSION = 17, 8  # of ONNX, from 2022: every runtime since then reads it
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 ACT = '''\
 """A policy that vecpsmbpo has trained, in NumPy alone: obs [..., O] -> action [..., A] in [-1, 1]."""
@@ -70,8 +70,8 @@ def run(words: Sequence[str]) -> int:
     if out.exists() and not out.is_dir():
         raise SettingError(f"out={out}: must be a directory")
     files.check_writable(out / "policy.npz")
-    if options["data"] == "minari":
-        dataset.check_minari()
+    for name in options["also"]:
+        _check_extra(name)
     found = runs.load(path)
     runs.check_lane(found, options["lane"])
     if found.settings.plans or found.settings.alternates:
@@ -81,16 +81,29 @@ def run(words: Sequence[str]) -> int:
     from vecpsmbpo.look import members
 
     trained = members.load(found, options["lane"])
-    export(trained, out, options["member"])
+    layers = export(trained, out, options["member"])
     written = [out / name for name in FILES]
-    if options["data"] == "minari":
+    if "onnx" in options["also"]:
+        written.append(out / "policy.onnx")
+        files.write(written[-1], lambda path: path.write_bytes(onnx_model(layers)))
+    if "minari" in options["also"]:
         written.append(dataset.write(trained, out / "minari"))
     print(f"written: {', '.join(map(str, written))}")
     return 0
 
 
-def export(trained: "Trained", out: Path, member: str) -> None:
-    """Writes the policy's files into the directory `out`.
+def _check_extra(name: str) -> None:
+    """Raises:
+    SettingError: there is no such addition, or its package is absent.
+    """
+    if name not in ("onnx", "minari"):
+        raise SettingError(f"also={name}: must be {OPTIONS['also'].allowed}")
+    if importlib.util.find_spec(name) is None:
+        raise SettingError(f"also={name}: needs the package {name}; pip install 'vecpsmbpo[{name}]'")
+
+
+def export(trained: "Trained", out: Path, member: str) -> dict[str, np.ndarray]:
+    """Writes the policy's files into the directory `out`; its `weights`.
 
     Raises:
         SettingError: there is no such member, or they cannot be written.
@@ -115,6 +128,7 @@ def export(trained: "Trained", out: Path, member: str) -> None:
     files.write_text(out / "act.py", ACT)
     files.write(out / "policy.jax", lambda path: path.write_bytes(function(layers)))
     files.write_text(out / "policy.json", json.dumps(about, indent=2) + "\n")
+    return layers
 
 
 def _index(trained: "Trained", member: str) -> int:
@@ -164,6 +178,28 @@ def function(layers: dict[str, np.ndarray]) -> bytes:
     shape = (*export.symbolic_shape("b"), layers["kernel_0"].shape[0])
     exported = export.export(jax.jit(act), platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, jnp.float32))
     return bytes(exported.serialize())
+
+
+def onnx_model(layers: dict[str, np.ndarray]) -> bytes:
+    """The same as an ONNX model with input `obs` [b, O] and output `action` [b, A]; no converter is needed for so few
+    operations."""
+    from onnx import TensorProto, checker, helper, numpy_helper
+
+    nodes, value, last = [], "obs", len(layers) // 2 - 1
+    for index in range(last + 1):
+        nodes.append(helper.make_node("Gemm", [value, f"kernel_{index}", f"bias_{index}"], [f"sum_{index}"]))
+        value = f"hidden_{index}" if index < last else "action"
+        nodes.append(helper.make_node("Relu" if index < last else "Tanh", [f"sum_{index}"], [value]))
+
+    def info(name: str, size: int) -> Any:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["b", size])
+
+    inputs, outputs = info("obs", layers["kernel_0"].shape[0]), info("action", len(layers[f"bias_{last}"]))
+    initial = [numpy_helper.from_array(np.ascontiguousarray(values), name) for name, values in layers.items()]
+    graph = helper.make_graph(nodes, "policy", [inputs], [outputs], initial)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+    checker.check_model(model)
+    return bytes(model.SerializeToString())
 
 
 def _save(layers: dict[str, np.ndarray], path: Path) -> None:
