@@ -79,6 +79,15 @@ def test_a_resumed_session_is_the_same_run_and_says_nothing_twice(tmp_path, reco
     assert [line["env_steps"] for line in metrics.read(tmp_path / "metrics.jsonl")] == [10, 20, 30, 40]
 
 
+def test_a_logger_that_joins_later_is_told_what_is_done_again(tmp_path, recorder):
+    for names, begins, steps in ((["tensorboard"], 0, (10, 20, 30)), (["wandb"], 20, (30, 40))):
+        log = metrics.RunLog(tmp_path, begins, _settings(*names), warn=pytest.fail)
+        log.metrics([_line(step) for step in steps])
+        log.close()
+    (made,) = recorder.made
+    assert [step for step, _ in made.told] == [30, 40]
+
+
 @pytest.mark.parametrize("where", ["__init__", "scalars", "flush", "files", "close"])
 def test_what_goes_wrong_with_a_logger_is_said_once(where, tmp_path, recorder, monkeypatch):
     def fail(self, *args):

@@ -64,13 +64,14 @@ class Loggers:
         """
         Args:
             env_steps: where the session begins.
-            sent: steps up to which loggers have been told everything in earlier sessions. Work that a kill undid is
-                done again, and the same; servers cannot forget, so they are not told twice.
+            sent: steps up to which the loggers of earlier sessions have been told everything. Work that a kill undid
+                is done again, and the same; servers cannot forget, so they are not told twice.
         """
         self._run_dir = run_dir
         self._loggers: dict[str, Logger] = {}
         self._failed: set[str] = set()
-        self._warn, self._sent = warn, sent
+        self._warn = warn
+        self._sent = {name: sent for name in settings.loggers if (run_dir / IDS.format(name)).exists()}
         for name in settings.loggers:
             try:
                 self._loggers[name] = self._make(name, settings, env_steps)
@@ -85,7 +86,7 @@ class Loggers:
 
     def scalars(self, values: Values, env_steps: int) -> None:
         for name in self._loggers:
-            if name == "tensorboard" or env_steps > self._sent:
+            if env_steps > self._sent.get(name, 0):
                 self._tell(name, "scalars", values, env_steps)
 
     def flush(self) -> None:

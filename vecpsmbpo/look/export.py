@@ -2,8 +2,8 @@
 
 policy.npz    the weights, as NumPy reads them
 act.py        the policy in NumPy alone, with the weights beside it
-policy.jax    the same as a function for CPUs, GPUs and TPUs (StableHLO, by `jax.export`), which needs JAX alone
 policy.json   which task, run, member and step it is of
+policy.jax    with also=jax: the same for CPUs, GPUs and TPUs, StableHLO that `jax.export.deserialize` reads
 policy.onnx   with also=onnx: the same for ONNX's runtimes
 minari/       with also=minari: the real data, as a Minari data set
 """
@@ -27,11 +27,12 @@ if TYPE_CHECKING:
 OPTIONS = {
     "member": arguments.text("best", "best or n,m"),
     "lane": arguments.whole(0),
-    "also": arguments.names(allowed="of onnx, minari, separated by commas"),
+    "also": arguments.names(allowed="of jax, onnx, minari, separated by commas"),
     "out": arguments.out("policy"),
 }
 
-FILES = ("policy.npz", "act.py", "policy.jax", "policy.json")
+FILES = ("policy.npz", "act.py", "policy.json")
+ADDITIONS = {"jax": "flatbuffers", "onnx": "onnx", "minari": "minari"}  # and the package that each needs
 OPSET, IR_VERSION = 17, 8  # of ONNX, from 2022: every runtime since then reads it
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 ACT = '''\
@@ -83,9 +84,10 @@ def run(words: Sequence[str]) -> int:
     trained = members.load(found, options["lane"])
     layers = export(trained, out, options["member"])
     written = [out / name for name in FILES]
-    if "onnx" in options["also"]:
-        written.append(out / "policy.onnx")
-        files.write(written[-1], lambda path: path.write_bytes(onnx_model(layers)))
+    for name, make in (("jax", jax_function), ("onnx", onnx_model)):
+        if name in options["also"]:
+            written.append(out / f"policy.{name}")
+            files.write(written[-1], functools.partial(_save_bytes, make(layers)))
     if "minari" in options["also"]:
         written.append(dataset.write(trained, out / "minari"))
     print(f"written: {', '.join(map(str, written))}")
@@ -96,10 +98,10 @@ def _check_extra(name: str) -> None:
     """Raises:
     SettingError: there is no such addition, or its package is absent.
     """
-    if name not in ("onnx", "minari"):
+    if name not in ADDITIONS:
         raise SettingError(f"also={name}: must be {OPTIONS['also'].allowed}")
-    if importlib.util.find_spec(name) is None:
-        raise SettingError(f"also={name}: needs the package {name}; pip install 'vecpsmbpo[{name}]'")
+    if importlib.util.find_spec(ADDITIONS[name]) is None:
+        raise SettingError(f"also={name}: needs the package {ADDITIONS[name]}; pip install 'vecpsmbpo[export]'")
 
 
 def export(trained: "Trained", out: Path, member: str) -> dict[str, np.ndarray]:
@@ -126,7 +128,6 @@ def export(trained: "Trained", out: Path, member: str) -> dict[str, np.ndarray]:
     }
     files.write(out / "policy.npz", functools.partial(_save, layers))
     files.write_text(out / "act.py", ACT)
-    files.write(out / "policy.jax", lambda path: path.write_bytes(function(layers)))
     files.write_text(out / "policy.json", json.dumps(about, indent=2) + "\n")
     return layers
 
@@ -160,7 +161,7 @@ def weights(actor: Any, action_size: int) -> dict[str, np.ndarray]:
     return found
 
 
-def function(layers: dict[str, np.ndarray]) -> bytes:
+def jax_function(layers: dict[str, np.ndarray]) -> bytes:
     """obs [b, O] -> action [b, A] of `weights`, for any b, as `jax.export.deserialize(...).call` takes it."""
     import jax
     import jax.numpy as jnp
@@ -200,6 +201,10 @@ def onnx_model(layers: dict[str, np.ndarray]) -> bytes:
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
     checker.check_model(model)
     return bytes(model.SerializeToString())
+
+
+def _save_bytes(content: bytes, path: Path) -> None:
+    path.write_bytes(content)
 
 
 def _save(layers: dict[str, np.ndarray], path: Path) -> None:
