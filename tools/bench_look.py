@@ -1,4 +1,4 @@
-"""Measures the commands that look at runs: seconds and memory against the size of the logs, which are made up.
+"""Measures the commands that look at runs: CPU seconds and memory against the size of the logs, which are made up.
 
     python tools/bench_look.py > results/look.csv
 
@@ -12,7 +12,6 @@ import random
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from vecpsmbpo import config
@@ -23,7 +22,7 @@ EPOCHS, SEEDS, MEMBERS = 125, 4, (5, 5)
 
 def main() -> None:
     writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(("command", "what", "count", "MiB of logs", "seconds", "peak MiB"))
+    writer.writerow(("command", "what", "count", "MiB of logs", "CPU seconds", "peak MiB"))
     with tempfile.TemporaryDirectory() as folder:
         for count in EPISODES:
             run = make(Path(folder) / f"episodes{count}", count)
@@ -37,12 +36,13 @@ def main() -> None:
 def make(path: Path, episodes: int, seed: int = 0) -> Path:
     """A run directory with `EPOCHS` epochs and this many episodes of each of its lanes together."""
     path.mkdir()
-    words = ["env=hopper", f"algo={'ops_mbpo' if seed % 2 else 'ps_mbpo'}", f"num_seeds={SEEDS}", f"run_dir={path}"]
+    algo = "ops_mbpo" if seed % 2 else "ps_mbpo"
+    words = ["env=hopper", f"algo={algo}", f"num_seeds={SEEDS}", f"seed={SEEDS * seed}", f"run_dir={path}"]
     config.save(config.compose(words), path)
     drawn, (n, m) = random.Random(seed), MEMBERS
     with (path / "metrics.jsonl").open("w") as file:
         for epoch in range(EPOCHS):
-            for lane in range(SEEDS):
+            for lane in range(SEEDS * seed, SEEDS * (seed + 1)):
                 score = 3000 * (1 - 0.97**epoch) + drawn.gauss(0, 100)
                 line = {"env_steps": 1000 * (epoch + 1), "seed": lane, "eval_return": score, "train_return": score}
                 line |= {"critic_loss": drawn.random(), "alpha": 0.1, "entropy": 0.5, "seconds": 60.0 * (epoch + 1)}
@@ -51,7 +51,7 @@ def make(path: Path, episodes: int, seed: int = 0) -> Path:
     with (path / "episodes.jsonl").open("w") as file:
         for index in range(episodes // SEEDS):
             probs = [[round(drawn.random(), 8) for _ in range(m)] for _ in range(n)]
-            for lane in range(SEEDS):
+            for lane in range(SEEDS * seed, SEEDS * (seed + 1)):
                 line = {"seed": lane, "episode": index + 1, "env_steps": steps * (index + 1), "model": index % n}
                 line |= {"policy": index % m, "return": drawn.gauss(1000, 100), "length": steps, "terminated": False}
                 file.write(json.dumps({**line, "truncated": True, "random": False, "probs": probs}) + "\n")
@@ -62,13 +62,12 @@ def _row(writer, command: str, what: str, count: int, runs: list[Path]) -> None:
     """Runs the command in a process of its own and writes what it took."""
     size = sum(path.stat().st_size for run in runs for path in run.glob("*.jsonl"))
     out = runs[0].parent / {"plot": "a.png", "compare": "a.csv", "report": "a.html"}[command]
-    began = time.perf_counter()
     words = [sys.executable, "-m", "vecpsmbpo.cli", command, *map(str, runs), f"out={out}"]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
     if status:
         sys.exit(f"{command} failed")
-    seconds, peak = time.perf_counter() - began, used.ru_maxrss / 1024
+    seconds, peak = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
     writer.writerow((command, what, count, f"{size / 2**20:.0f}", f"{seconds:.1f}", f"{peak:.0f}"))
     sys.stdout.flush()
 

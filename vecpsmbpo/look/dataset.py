@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import tempfile
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,7 +45,8 @@ def write(trained: "Trained", folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".") as beside:
-            with _root(Path(beside)):
+            with _root(Path(beside)), warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of authors and links that a data set could have
                 minari.create_dataset_from_buffers(
                     name, buffers, **spaces, algorithm_name=f"vecpsmbpo {run.settings.algo}", description=str(run.name)
                 )
