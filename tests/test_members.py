@@ -281,7 +281,10 @@ MISTAKES = [
     (["diagnose", "run", "out=a.gif"], "out=a.gif: must be a file that ends in .json, .png, .svg, .pdf"),
     (["diagnose", "run", "out=a.json", "lane=2"], "lane=2: must be below 2"),
     (["diagnose", "run", "out=file/a.json"], "out=file/a.json: cannot be written (Not a directory)"),
-    (["diagnose", "bare"], "run_dir=bare: holds no checkpoint that can be read"),
+    (["diagnose", "bare"], "run_dir=bare: holds no checkpoint yet"),
+    (["report", "bare", "diagnostics=true", "out=a.html"], "run_dir=bare: holds no checkpoint yet"),
+    (["report", "bare", "diagnostics=yes"], "diagnostics=yes: must be one of false, true"),
+    (["render", "bare", "out=a.gif", "steps=7"], "steps=7: there is none"),
     (
         ["report", "half", "out=a.html"],
         "half/diagnostics.json: cannot be read; vecpsmbpo diagnose half writes it again",

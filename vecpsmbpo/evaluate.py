@@ -66,8 +66,9 @@ def restore_each(stored: Settings, steps: Collection[int] = ()) -> Iterator[tupl
     time.
 
     Raises:
-        SettingError: there is not enough memory.
+        SettingError: there is not enough memory, or there are checkpoints and none of them can be read.
     """
+    read, errors = False, []
     with _opened(stored) as (driver, shapes, checkpoints):
         for step in checkpoints.steps():
             if steps and step not in steps:
@@ -75,11 +76,16 @@ def restore_each(stored: Settings, steps: Collection[int] = ()) -> Iterator[tupl
             try:
                 saved = checkpoints.restore(shapes, driver.layout, warn=lambda text: None, at=step)
             except SettingError as error:
-                _warn(str(error))
+                errors.append(error)
             else:
                 assert saved is not None
+                read = True
                 yield driver, saved
                 del saved  # before the next is read: one state is all there may be room for
+    if errors and not read:
+        raise errors[-1]
+    for passed_over in errors:
+        _warn(str(passed_over))
 
 
 @contextlib.contextmanager

@@ -117,7 +117,7 @@ def load_each(run: Run, lane: int = 0, steps: Collection[int] = ()) -> Iterator[
         yield _trained(run, driver.algorithm, saved, lane)
         del saved  # as in `restore_each`
     if not found:
-        raise SettingError(f"run_dir={run.path}: holds no checkpoint that can be read")
+        raise SettingError(f"run_dir={run.path}: holds no checkpoint yet")
 
 
 def _trained(run: Run, algorithm: Algorithm, saved: Saved, lane: int) -> Trained:

@@ -68,7 +68,8 @@ def run(words: Sequence[str]) -> int:
     runs.check_lane(found, options["lane"])
     kept = runs.kept_steps(found)
     if missing := [step for step in options["steps"] if step not in kept]:
-        raise SettingError(f"steps={missing[0]}: must be of {', '.join(map(str, kept))}, which checkpoints are kept of")
+        known = f"must be of {', '.join(map(str, kept))}, which checkpoints are kept of" if kept else "there is none"
+        raise SettingError(f"steps={missing[0]}: {known}")
     if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise SettingError(f"out={out}: .mp4 needs imageio-ffmpeg; pip install 'vecpsmbpo[video]', or take .gif")
     os.environ["MUJOCO_GL"] = platform()
