@@ -217,11 +217,11 @@ class Mlflow:
     """MLflow: one run for the run directory, at the tracking server that MLFLOW_TRACKING_URI names."""
 
     def __init__(self, settings: Settings, run_dir: Path):
-        for name in ("mlflow", "alembic"):  # which tell of every step of making a data base
-            logging.getLogger(name).setLevel(logging.ERROR)
         from mlflow import MlflowClient
         from mlflow.entities import Metric
 
+        for name in ("mlflow", "alembic"):  # which tell of every step of making a data base
+            logging.getLogger(name).setLevel(logging.ERROR)
         self._client, self._metric = MlflowClient(), Metric
         self._id = _id(run_dir, "mlflow", lambda: self._create(settings, run_dir))
         self._client.update_run(self._id, status="RUNNING")
