@@ -13,9 +13,9 @@ from PIL import Image
 
 import vecpsmbpo
 from tests import looks
-from tests.helpers import command
-from vecpsmbpo import cli
-from vecpsmbpo.look import members, render, runs
+from tests.helpers import command, environment
+from vecpsmbpo import cli, config, metrics, training
+from vecpsmbpo.look import diagnose, export, members, render, runs, stage, states
 
 # What rendering needs of the machine; without it (a bare container) the tests of pictures have nothing to test.
 try:
@@ -31,6 +31,7 @@ def trained(tmp_path_factory):
     """N = M = 2 on the original cartpole; its first seed."""
     folder = tmp_path_factory.mktemp("trained")
     words = ["env=cartpole_swingup", "backend=host", "size=tiny", "total_steps=80", "report=true", "num_seeds=2"]
+    words += ["keep_checkpoints=3"]
     result = command("train", *words, "run_dir=run", cwd=folder)
     assert result.returncode == 0, result.stderr
     return folder / "run"
@@ -84,6 +85,87 @@ def test_an_exported_policy_acts_the_same_without_this_package(trained, tmp_path
     assert (out / "policy.npz").read_bytes() == before
 
 
+def test_the_real_data_are_exported_as_minari_reads_them(trained, tmp_path, capsys):
+    minari = pytest.importorskip("minari")
+    out = tmp_path / "policy"
+    words = ["export", str(trained), "also=minari", "lane=1", f"out={out}"]
+    assert cli.main(words) == 0
+    data = minari.MinariDataset(out / "minari" / "vecpsmbpo" / "cartpole_swingup-v0" / "data")
+    lines = [line for line in metrics.read(trained / "episodes.jsonl") if line["seed"] == 1]
+    assert data.total_episodes == len(lines) == 3
+    for episode, line in zip(data.iterate_episodes(), lines, strict=True):
+        assert episode.rewards.sum() == pytest.approx(line["return"], abs=1e-4)
+        assert episode.observations.shape == (line["length"] + 1, 5)
+        assert (episode.terminations.sum(), episode.truncations.sum()) == (0, 1)
+        assert np.abs(episode.actions).max() <= 1
+    capsys.readouterr()
+    assert cli.main(words) == 2  # it is there already
+    assert capsys.readouterr().err.endswith("cartpole_swingup-v0: is there already\n")
+
+
+@pytest.mark.parametrize(("name", "package"), export.ADDITIONS.items())
+def test_an_export_without_its_extra_names_it(name, package, shelf, monkeypatch, capsys):
+    monkeypatch.setattr(export.importlib.util, "find_spec", lambda name: None)
+    assert cli.main(["export", "run", f"also={name}"]) == 2
+    expected = f"vecpsmbpo: also={name}: needs the package {package}; pip install 'vecpsmbpo[export]'\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_policies_for_jax_and_onnx_act_the_same(trained, tmp_path):
+    pytest.importorskip("onnx")
+    pytest.importorskip("flatbuffers")
+    from jax import export as jax_export
+    from onnx.reference import ReferenceEvaluator
+
+    assert cli.main(["export", str(trained), "also=jax,onnx", f"out={tmp_path}"]) == 0
+    obs = np.random.default_rng(0).normal(size=(7, 5)).astype(np.float32)
+    expected = vecpsmbpo.load(trained).policy(obs)
+    (action,) = ReferenceEvaluator(str(tmp_path / "policy.onnx")).run(None, {"obs": obs})
+    np.testing.assert_allclose(action, expected, atol=1e-5)
+    function = jax_export.deserialize(bytearray((tmp_path / "policy.jax").read_bytes()))
+    np.testing.assert_allclose(function.call(obs), expected, atol=1e-5)
+    assert function.call(obs[:3]).shape == (3, 1)  # of any number of observations
+    assert function.platforms == ("cpu", "cuda", "rocm", "tpu")
+
+
+# ── diagnostics ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_run_is_diagnosed_and_its_report_says_so(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(states, "has_umap", lambda: False)  # its compilation takes half a minute
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    assert cli.main(["diagnose", str(run), "horizon=4", "lane=1"]) == 0
+    found = json.loads((run / "diagnostics.json").read_text())
+    assert (found["env_steps"], found["lane"]) == (80, {"seed": 1})
+    assert [point["env_steps"] for point in found["history"]] == [0, 40, 80]  # keep_checkpoints=3
+    assert [point["errors"] is None for point in found["history"]] == [True, True, False]  # fitted after the warm-up
+    models = found["models"]
+    assert np.shape(models["error"]) == np.shape(models["expected"]) == (2, 4, 6)
+    assert np.shape(models["coverage"]) == (2, 3, 6)
+    assert found["critics"]["members"] == ["0,0", "0,1", "1,0", "1,1"]
+    assert found["critics"]["states"] == 4 * 25  # what lies beyond the time limit is seen, too
+    difference = found["critics"]["q"] - found["critics"]["earned"]
+    assert found["critics"]["bias"] == pytest.approx(difference, abs=1e-3)
+    assert found["states"]["method"] == "principal components"
+    assert cli.main(["report", str(run), f"out={tmp_path / 'r.html'}"]) == 0
+    page = (tmp_path / "r.html").read_text()
+    assert "put to the test" in page
+    assert "error of the reward" in page
+
+
+def test_plans_are_diagnosed_as_far_as_they_can_be(tmp_path):
+    """PETS has models, and neither critics nor imagined data."""
+    words = ["env=cartpole_swingup", "backend=host", "size=tiny", "total_steps=80", "algo=pets"]
+    assert training.train(config.compose([*words, f"run_dir={tmp_path / 'run'}"])) == 0
+    out = tmp_path / "a.png"
+    assert cli.main(["diagnose", str(tmp_path / "run"), "horizon=4", f"out={out}"]) == 0
+    assert Image.open(out).size[0] > 800
+    found = diagnose.measure(runs.load(tmp_path / "run"), horizon=4)
+    assert np.shape(found["models"]["error"]) == (2, 4, 6)
+    assert (found["critics"], found["states"]) == (None, None)
+
+
 # ── videos ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -104,6 +186,53 @@ def test_render_draws_every_member_and_the_robot_moves(trained, tmp_path):
 def _seek(film, index):
     film.seek(index)
     return film
+
+
+@draws
+def test_render_draws_a_member_at_steps_of_training(trained, tmp_path):
+    words = ["steps=[0,80]", "member=1,0", "length=12", "width=80", f"out={tmp_path / 'a.png'}"]
+    result = command("render", str(trained), *words, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"), float)
+    assert picture.shape == (2 * 60, 4 * 80, 3)  # a row for each step, four frames in it
+    first, last = np.split(picture, 2)
+    assert np.abs(first[20:] - last[20:]).max() > 50  # another policy moves it elsewhere
+
+
+DRAWN = """
+import collections, types
+import numpy as np
+from vecpsmbpo import envs
+from vecpsmbpo.look import stage
+
+def state(*names, value):
+    for name in reversed(("pipeline_state", *names)):
+        value = collections.namedtuple("State", [name])(value)
+    return value
+
+port = envs.make("cartpole_swingup", "mjx")
+# Playground is an extra; of its environments only these names are used.
+playground = types.SimpleNamespace(inner=types.SimpleNamespace(mj_model=port.model, dt=0.01), _action_repeat=2)
+cart, arm = np.array([[[0.0, 0.0]], [[0.5, 2.0]]]), np.array([[[0.0, 0.0, 0.1, 0.1]], [[1.0, 1.0, 0.1, 0.1]]])
+for env, names, positions, dt in (
+    (port, ["qpos"], cart, 0.01),
+    (playground, ["data", "qpos"], cart, 0.02),
+    (envs.make("brax", "mjx", id="reacher"), ["pipeline_state", "q"], arm, 0.02),
+):
+    scene = stage.scene(env)
+    renderer = stage._renderer(scene.model, 80)
+    first, second = (stage._draw(scene, *renderer, state(*names, value=x)).astype(float) for x in positions)
+    assert first.std() > 5 and np.abs(first - second).max() > 50
+    assert abs(scene.dt - dt) < 1e-6, scene.dt
+"""
+
+
+@draws
+def test_jax_environments_are_drawn(tmp_path):
+    """What moves in the simulator moves in the picture. MuJoCo chooses what it draws with when it is imported."""
+    drawn = {**environment(), "MUJOCO_GL": render.platform()}
+    result = subprocess.run([sys.executable, "-c", DRAWN], env=drawn, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
 
 
 @draws
@@ -135,7 +264,7 @@ def test_a_mosaic_has_its_tiles_in_rows():
 def test_an_environment_that_can_draw_itself_does():
     picture = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
     env = types.SimpleNamespace(render_mode="rgb_array", render=lambda: picture, unwrapped=types.SimpleNamespace())
-    np.testing.assert_array_equal(render.camera(types.SimpleNamespace(env=env), 64)(), picture)
+    np.testing.assert_array_equal(stage.camera(types.SimpleNamespace(env=env), 64)(), picture)
 
 
 MISTAKES = [
@@ -148,7 +277,22 @@ MISTAKES = [
     (["export", "run", "out=file"], "out=file: must be a directory"),
     (["export", "pets"], "run_dir=pets: only policies that learn by SAC can be exported, not algo=pets"),
     (["export", "bare"], "run_dir=bare: holds no checkpoint yet"),
-    (["render", "brax"], "render: env=brax has no simulator on the host that could draw it"),
+    (["diagnose", "run", "run2"], "run_dir: diagnose takes 1 run, not 2"),
+    (["diagnose", "run", "out=a.gif"], "out=a.gif: must be a file that ends in .json, .png, .svg, .pdf"),
+    (["diagnose", "run", "out=a.json", "lane=2"], "lane=2: must be below 2"),
+    (["diagnose", "run", "out=file/a.json"], "out=file/a.json: cannot be written (Not a directory)"),
+    (["diagnose", "bare"], "run_dir=bare: holds no checkpoint yet"),
+    (["report", "bare", "diagnostics=true", "out=a.html"], "run_dir=bare: holds no checkpoint yet"),
+    (["report", "bare", "diagnostics=yes"], "diagnostics=yes: must be one of false, true"),
+    (["render", "bare", "out=a.gif", "steps=7"], "steps=7: there is none"),
+    (
+        ["report", "half", "out=a.html"],
+        "half/diagnostics.json: cannot be read; vecpsmbpo diagnose half writes it again",
+    ),
+    (["render", "run", "out=a.gif", "steps=41"], "steps=41: must be of 0, 40, 80, which checkpoints are kept of"),
+    (["render", "run", "out=a.gif", "steps=[0,x]"], "steps=[0,x]: must be whole numbers, separated by commas"),
+    (["render", "run", "out=a.gif", "steps=0,40", "member=all"], "member=all: with steps= there is room for one"),
+    (["export", "run", "also=rlds"], "also=rlds: must be of jax, onnx, minari, separated by commas"),
 ]
 
 
@@ -160,7 +304,8 @@ def shelf(trained, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     looks.write(tmp_path / "pets", looks.epochs([1]), algo="pets")
     looks.write(tmp_path / "bare", looks.epochs([1]), backend="host")
-    looks.write(tmp_path / "brax", looks.epochs([1]), **{"env": "brax", "env.id": "reacher"})
+    looks.write(tmp_path / "half", looks.epochs([1]))
+    (tmp_path / "half" / "diagnostics.json").write_text('{"history": [')
     return tmp_path
 
 

@@ -286,7 +286,7 @@ def test_log_files_drop_what_will_be_done_again(tmp_path):
     lines = [{"env_steps": step, "seed": 0, "return": 1.0, "length": 5} for step in (10, 20, 30)]
     path = tmp_path / "episodes.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"env_steps": 40, "se')
-    log = metrics.RunLog(tmp_path, env_steps=20)
+    log = metrics.RunLog(tmp_path, 20, tiny(), warn=pytest.fail)
     log.episodes([{"env_steps": 25, "seed": 0, "return": 2.0, "length": 5}])
     log.close()
     assert [line["env_steps"] for line in metrics.read(path)] == [10, 20, 25]

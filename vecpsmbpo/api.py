@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import config, dynamics
+from vecpsmbpo import config, dynamics, loggers
 from vecpsmbpo.algorithms import Algorithm
 from vecpsmbpo.evaluate import evaluate
 from vecpsmbpo.look import members, runs
@@ -163,6 +163,7 @@ def train(**settings: Any) -> Run:
         DiskError: the run directory cannot be written.
     """
     resolved = config.resolve(config.overrides_of(settings))
+    loggers.check(resolved.loggers)
     run_training(resolved)
     return Run(resolved.run_dir)
 

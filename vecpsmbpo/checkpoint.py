@@ -17,7 +17,6 @@ from vecpsmbpo.types import TrainState
 
 _log = logging.getLogger(__name__)
 FORMAT = 2  # of what is saved; a state that gains or loses fields is another one
-KEPT = 2  # the newest and the one before it, should the newest be damaged
 IN_FLIGHT_GB = 0.2  # being written or read at a time
 CHUNK_BYTES = 32 * 2**20  # of one file
 
@@ -37,13 +36,14 @@ class Checkpoints:
     overwrite. Rings are not copied to be saved: orbax is handed views of them, and writes few of them at a time.
     """
 
-    def __init__(self, directory: Path, *, read_only: bool = False):
+    def __init__(self, directory: Path, *, keep: int | None = None, read_only: bool = False):
+        """`keep`: how many of the newest stay; None: all."""
         self._directory = directory
         self._damaged: list[int] = []
         for name in ("absl", "orbax"):
             logging.getLogger(name).setLevel(logging.ERROR)
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=KEPT,
+            max_to_keep=keep,
             enable_async_checkpointing=False,
             cleanup_tmp_directories=not read_only,  # of a save that was killed
             read_only=read_only,
@@ -78,19 +78,24 @@ class Checkpoints:
         self._manager.save(step, args=items, force=True)
         self._manager.wait_until_finished()
 
-    def restore(self, shapes: TrainState, layout: Layout, warn: Callable[[str], None]) -> Saved | None:
+    def restore(
+        self, shapes: TrainState, layout: Layout, warn: Callable[[str], None], at: int | None = None
+    ) -> Saved | None:
         """The newest checkpoint that can be read, laid out on the mesh; None where there is none at all.
 
         Damaged ones are warned of. Nothing is removed.
 
         Args:
             shapes: of the train state, as `jax.eval_shape` of its initialisation gives them.
+            at: only the checkpoint of this step.
 
         Raises:
             SettingError: there are checkpoints, and none can be read, or an older version of this program wrote them.
         """
         reason: Exception | None = None
         for step in reversed(self.steps()):
+            if at not in (None, step):
+                continue
             try:
                 items = self._read(step, shapes, layout)
             except (MemoryError, SettingError):

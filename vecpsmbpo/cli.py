@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from vecpsmbpo import crash
+from vecpsmbpo import crash, loggers
 from vecpsmbpo.settings import SettingError, Settings
 
 HELP = """\
@@ -20,6 +20,7 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo plot runs/x runs/y out=curves.png       learning curves, grouped by what differs
   vecpsmbpo compare runs/x runs/y                   the same as a table, with intervals
   vecpsmbpo report runs/x out=report.html           all a run has to show, on one page
+  vecpsmbpo diagnose runs/x                         how good its models and critics are, into the run; or out=x.png
   vecpsmbpo render runs/x out=walk.mp4              its best member at work; member=all: all of them
   vecpsmbpo export runs/x out=policy/               its best policy as files that need nothing of this
   vecpsmbpo figure fig9 size=cpu out=fig9.png       a figure of the paper, from the runs of its experiment
@@ -35,7 +36,7 @@ What each setting does stands beside its default in {config}.
 
 
 # Commands that read runs and show them: modules of `vecpsmbpo.look`.
-LOOKS = ("plot", "compare", "report", "figure", "render", "export")
+LOOKS = ("plot", "compare", "report", "figure", "render", "export", "diagnose")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -90,6 +91,7 @@ def _train(overrides: list[str]) -> int:
 
 
 def _run(settings: Settings) -> int:
+    loggers.check(settings.loggers)
     from vecpsmbpo.training import DiskError, train
 
     try:

@@ -178,7 +178,7 @@ def save(settings: Settings, run_dir: Path) -> None:
     values: dict[str, Any] = dataclasses.asdict(settings)
     values["env_options"] = dict(settings.env_options)
     values["sweep"] = {name: list(swept) for name, swept in settings.sweep}
-    values["real_ratio_arms"] = list(settings.real_ratio_arms)
+    values |= {name: list(value) for name, value in values.items() if isinstance(value, tuple)}
     beside = run_dir / f"{CONFIG_FILE}.tmp"
     beside.write_text(yaml.safe_dump(values, sort_keys=False))
     beside.replace(run_dir / CONFIG_FILE)  # at once: a run whose config is cut short could not be resumed

@@ -1,5 +1,7 @@
 """Whole episodes of a trained run's policies: what `vecpsmbpo eval` shows and `Run.evaluate` returns."""
 
+import contextlib
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from vecpsmbpo import checkpoint, crash, resources, runtime
 from vecpsmbpo.drivers import Driver, Returns
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
+from vecpsmbpo.types import TrainState
 
 
 def evaluate(stored: Settings, settings: Settings) -> tuple[int, Returns]:
@@ -51,13 +54,53 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
     Raises:
         SettingError: the run holds no checkpoint, or there is not enough memory for it.
     """
+    with _opened(stored) as (driver, shapes, checkpoints):
+        saved = checkpoints.restore(shapes, driver.layout, warn=_warn)
+    if saved is None:
+        raise SettingError(f"run_dir={stored.run_dir}: holds no checkpoint yet")
+    return driver, saved
+
+
+def restore_each(stored: Settings, steps: Collection[int] = ()) -> Iterator[tuple[Driver, checkpoint.Saved]]:
+    """As `restore`, of every checkpoint that is kept and can be read, or of those at `steps`; oldest first and one at a
+    time.
+
+    Raises:
+        SettingError: there is not enough memory, or there are checkpoints and none of them can be read.
+    """
+    read, errors = False, []
+    with _opened(stored) as (driver, shapes, checkpoints):
+        for step in checkpoints.steps():
+            if steps and step not in steps:
+                continue
+            try:
+                saved = checkpoints.restore(shapes, driver.layout, warn=lambda text: None, at=step)
+            except SettingError as error:
+                errors.append(error)
+            else:
+                assert saved is not None
+                read = True
+                yield driver, saved
+                del saved  # before the next is read: one state is all there may be room for
+    if errors and not read:
+        raise errors[-1]
+    for passed_over in errors:
+        _warn(str(passed_over))
+
+
+@contextlib.contextmanager
+def _opened(stored: Settings) -> Iterator[tuple[Driver, TrainState, checkpoint.Checkpoints]]:
+    """A run's driver, the shapes of its state, and its checkpoints to be read."""
     runtime.configure(stored)
     driver = make_driver(stored)
     shapes = driver.shapes(*initial_inputs(stored))
     resources.check_memory(stored, driver.algorithm.spec, driver.layout, shapes)
     checkpoints = checkpoint.Checkpoints(Path(stored.run_dir) / "checkpoints", read_only=True)
-    saved = checkpoints.restore(shapes, driver.layout, warn=lambda text: Console(stderr=True).print(text))
-    checkpoints.close()
-    if saved is None:
-        raise SettingError(f"run_dir={stored.run_dir}: holds no checkpoint yet")
-    return driver, saved
+    try:
+        yield driver, shapes, checkpoints
+    finally:
+        checkpoints.close()
+
+
+def _warn(text: str) -> None:
+    Console(stderr=True).print(text)

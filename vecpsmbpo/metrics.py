@@ -1,4 +1,4 @@
-"""What a run writes down: metrics.jsonl, episodes.jsonl and TensorBoard, each epoch and episode exactly once.
+"""What a run writes down: metrics.jsonl and episodes.jsonl, each epoch and episode exactly once; loggers are told, too.
 
 And sessions.jsonl: a line for each time that somebody began, or went on with, the run.
 """
@@ -6,19 +6,19 @@ And sessions.jsonl: a line for each time that somebody began, or went on with, t
 import json
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from tensorboardX import SummaryWriter
 
 from vecpsmbpo import mixture
+from vecpsmbpo.loggers import Loggers
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
-METRICS_FILE, EPISODES_FILE, TENSORBOARD = "metrics.jsonl", "episodes.jsonl", "tensorboard"
+METRICS_FILE, EPISODES_FILE = "metrics.jsonl", "episodes.jsonl"
 SESSIONS_FILE = "sessions.jsonl"
 Line = dict[str, Any]
 
@@ -26,14 +26,13 @@ Line = dict[str, Any]
 class RunLog:
     """The log files of one run directory."""
 
-    def __init__(self, run_dir: Path, env_steps: int, lane: Iterable[str] = ("seed",)):
-        """`lane`: the names by whose values lines of the same step are told apart.
+    def __init__(self, run_dir: Path, env_steps: int, settings: Settings, warn: Callable[[str], None]):
+        """`warn`: is told what goes wrong with a logger.
 
         Lines beyond `env_steps` belong to work that a kill undid and that will be done again: they are dropped."""
-        self._run_dir, self._lane = run_dir, tuple(lane)
-        for name in (METRICS_FILE, EPISODES_FILE):
-            _rewind(run_dir / name, env_steps)
-        self._tensorboard = SummaryWriter(str(run_dir / TENSORBOARD), purge_step=env_steps + 1)
+        self._run_dir, self._lane = run_dir, tuple(settings.lanes[0])
+        written = max(_rewind(run_dir / name, env_steps) for name in (METRICS_FILE, EPISODES_FILE))
+        self._loggers = Loggers(settings, run_dir, env_steps, written, warn)
 
     def session(self, line: Line) -> None:
         """Writes down that a session began, and what with."""
@@ -52,16 +51,15 @@ class RunLog:
         _append(self._run_dir / METRICS_FILE, lines)
         for line in lines:
             self._scalars(line, set(line) - {"env_steps", "seed"}, "epoch")
-        self._tensorboard.flush()
+        self._loggers.flush()
 
     def _scalars(self, line: Line, names: Iterable[str], group: str) -> None:
         which = "_".join(f"{name}{line[name]}" for name in self._lane)
-        for name in names:
-            if isinstance(line[name], int | float):
-                self._tensorboard.add_scalar(f"{group}/{name}/{which}", line[name], line["env_steps"])
+        numbers = {name: line[name] for name in names if isinstance(line[name], int | float)}
+        self._loggers.scalars({f"{group}/{name}/{which}": value for name, value in numbers.items()}, line["env_steps"])
 
     def close(self) -> None:
-        self._tensorboard.close()
+        self._loggers.close()
 
 
 def read(path: Path) -> list[Line]:
@@ -83,11 +81,14 @@ def _append(path: Path, lines: list[Line]) -> None:
         os.fsync(file.fileno())
 
 
-def _rewind(path: Path, env_steps: int) -> None:
-    kept = [line for line in read(path) if line["env_steps"] <= env_steps]
+def _rewind(path: Path, env_steps: int) -> int:
+    """Drops lines beyond `env_steps`; the last step that there was a line of, or 0."""
+    lines = read(path)
+    kept = [line for line in lines if line["env_steps"] <= env_steps]
     beside = path.with_suffix(".tmp")
     beside.write_text("".join(_json(line) for line in kept))
     beside.replace(path)
+    return max((line["env_steps"] for line in lines), default=0)
 
 
 def _json(line: Line) -> str:

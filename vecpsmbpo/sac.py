@@ -189,6 +189,7 @@ def updates(agent: Agent, batches: Transition, noise: Noise, hyper: Hyper, **how
     """
 
     def body(agent, xs):
-        return update(agent, *xs, hyper, **how), None
+        batch, noise = xs
+        return update(agent, batch, noise, hyper, **how), None
 
     return jax.lax.scan(body, agent, (batches, noise))[0]

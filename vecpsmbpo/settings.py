@@ -54,7 +54,9 @@ class Settings:
     eval_policy: str = _choice("posterior", "best", "average")
     eval_actions: str = _choice("mean", "sampled")
     checkpoint_every: int = _whole(1)
+    keep_checkpoints: int = _whole(1)
     report: bool
+    loggers: tuple[str, ...] = _choice("tensorboard", "wandb", "mlflow")
     devices: int = _whole(0)
     compile_cache: bool
     # real data
@@ -218,7 +220,7 @@ TRACED = (
 # Settings that a resumed run may change: they steer the loop around the run, not what it computes.
 CHANGEABLE = frozenset(
     {"total_steps", "eval_episodes", "eval_policy", "eval_actions", "checkpoint_every", "report", "devices"}
-    | {"compile_cache"}
+    | {"keep_checkpoints", "loggers", "compile_cache"}
 )
 
 
@@ -226,7 +228,7 @@ def allowed(name: str) -> str:
     """What the setting `name` may be, in words."""
     field = FIELDS[name]
     if choices := field.metadata.get("choices"):
-        return "one of " + ", ".join(choices)
+        return ("a list of " if field.type == tuple[str, ...] else "one of ") + ", ".join(choices)
     kinds: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a name"}
     kinds[tuple[float, ...]] = "a list of numbers, each"
     kind = kinds[field.type]
@@ -253,6 +255,10 @@ def check(name: str, value: Any) -> Any:
         if not isinstance(value, str) or value not in field.metadata.get("choices", (value,)):
             raise complaint
         return value
+    if field.type == tuple[str, ...]:
+        if not isinstance(value, list | tuple) or not set(value) <= set(field.metadata["choices"]):
+            raise complaint
+        return tuple(dict.fromkeys(value))
     if field.type == tuple[float, ...]:
         if not isinstance(value, list | tuple) or not value:
             raise complaint

@@ -49,6 +49,16 @@ def whole(default: int, at_least: int = 0) -> Option:
     return Option(default, read, f"a whole number, at least {at_least}")
 
 
+def wholes() -> Option:
+    """Whole numbers, none by default; `1,2` or `[1,2]`."""
+    one = whole(0)
+    return Option(
+        (),
+        lambda value: tuple(one.read(part) for part in value.removeprefix("[").removesuffix("]").split(",")),
+        "whole numbers, separated by commas",
+    )
+
+
 def number(default: float | None = None) -> Option:
     def read(value: str) -> float:
         found = float(value)

@@ -2,29 +2,39 @@
 
 policy.npz    the weights, as NumPy reads them
 act.py        the policy in NumPy alone, with the weights beside it
-policy.jax    the same as a compiled function for any machine (`jax.export`); needs JAX alone
 policy.json   which task, run, member and step it is of
+policy.jax    with also=jax: the same for CPUs, GPUs and TPUs, StableHLO that `jax.export.deserialize` reads
+policy.onnx   with also=onnx: the same for ONNX's runtimes
+minari/       with also=minari: the real data, as a Minari data set
 """
 
 import functools
+import importlib.util
 import json
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vecpsmbpo.look import arguments, files, runs
+from vecpsmbpo.look import arguments, dataset, files, runs
 from vecpsmbpo.settings import SettingError
+
+if TYPE_CHECKING:
+    from vecpsmbpo.look.members import Trained
 
 OPTIONS = {
     "member": arguments.text("best", "best or n,m"),
     "lane": arguments.whole(0),
+    "also": arguments.names(allowed="of jax, onnx, minari, separated by commas"),
     "out": arguments.out("policy"),
 }
 
 FILES = ("policy.npz", "act.py", "policy.json")
+ADDITIONS = {"jax": "flatbuffers", "onnx": "onnx", "minari": "minari"}  # and the package that each needs
+OPSET, IR_VERSION = 17, 8  # of ONNX, from 2022: every runtime since then reads it
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 ACT = '''\
 """A policy that vecpsmbpo has trained, in NumPy alone: obs [..., O] -> action [..., A] in [-1, 1]."""
 
@@ -61,35 +71,57 @@ def run(words: Sequence[str]) -> int:
     if out.exists() and not out.is_dir():
         raise SettingError(f"out={out}: must be a directory")
     files.check_writable(out / "policy.npz")
+    for name in options["also"]:
+        _check_extra(name)
     found = runs.load(path)
+    runs.check_lane(found, options["lane"])
     if found.settings.plans or found.settings.alternates:
         raise SettingError(
             f"run_dir={path}: only policies that learn by SAC can be exported, not algo={found.settings.algo}"
         )
-    export(found, out, options["member"], options["lane"])
-    print(f"written: {', '.join(str(out / name) for name in FILES)}")
+    from vecpsmbpo.look import members
+
+    trained = members.load(found, options["lane"])
+    layers = export(trained, out, options["member"])
+    written = [out / name for name in FILES]
+    for name, make in (("jax", jax_function), ("onnx", onnx_model)):
+        if name in options["also"]:
+            written.append(out / f"policy.{name}")
+            files.write(written[-1], functools.partial(_save_bytes, make(layers)))
+    if "minari" in options["also"]:
+        written.append(dataset.write(trained, out / "minari"))
+    print(f"written: {', '.join(map(str, written))}")
     return 0
 
 
-def export(run: runs.Run, out: Path, member: str, lane: int) -> None:
-    """Writes the files into the directory `out`.
+def _check_extra(name: str) -> None:
+    """Raises:
+    SettingError: there is no such addition, or its package is absent.
+    """
+    if name not in ADDITIONS:
+        raise SettingError(f"also={name}: must be {OPTIONS['also'].allowed}")
+    if importlib.util.find_spec(ADDITIONS[name]) is None:
+        raise SettingError(f"also={name}: needs the package {ADDITIONS[name]}; pip install 'vecpsmbpo[export]'")
+
+
+def export(trained: "Trained", out: Path, member: str) -> dict[str, np.ndarray]:
+    """Writes the policy's files into the directory `out`; its `weights`.
 
     Raises:
-        SettingError: as `members.load`; there is no such member.
+        SettingError: there is no such member, or they cannot be written.
     """
     import jax
 
     from vecpsmbpo.look import members
 
-    trained = members.load(run, lane)
-    index = _index(trained, member)
+    run, index = trained.run, _index(trained, member)
     layers = weights(jax.tree.map(lambda x: np.asarray(x[index]), trained.actors()), trained.algorithm.spec.action_size)
     about = {
         "task": run.settings.task,
         "run": run.name,
         "algo": run.settings.algo,
         "env_steps": trained.step,
-        **run.settings.lanes[lane],
+        **run.settings.lanes[trained.index],
         "member": members.member_names(run)[index],
         "obs_size": trained.algorithm.spec.obs_size,
         "action_size": trained.algorithm.spec.action_size,
@@ -97,9 +129,10 @@ def export(run: runs.Run, out: Path, member: str, lane: int) -> None:
     files.write(out / "policy.npz", functools.partial(_save, layers))
     files.write_text(out / "act.py", ACT)
     files.write_text(out / "policy.json", json.dumps(about, indent=2) + "\n")
+    return layers
 
 
-def _index(trained: Any, member: str) -> int:
+def _index(trained: "Trained", member: str) -> int:
     """n·M + m of the member.
 
     Raises:
@@ -126,6 +159,52 @@ def weights(actor: Any, action_size: int) -> dict[str, np.ndarray]:
         found[f"kernel_{index}"] = kernel[:, :action_size] if last else kernel
         found[f"bias_{index}"] = bias[:action_size] if last else bias
     return found
+
+
+def jax_function(layers: dict[str, np.ndarray]) -> bytes:
+    """obs [b, O] -> action [b, A] of `weights`, for any b, as `jax.export.deserialize(...).call` takes it."""
+    import jax
+    import jax.numpy as jnp
+    from jax import export
+
+    count = len(layers) // 2
+
+    def act(obs: Any) -> Any:
+        hidden = obs
+        for index in range(count):
+            hidden = hidden @ layers[f"kernel_{index}"] + layers[f"bias_{index}"]
+            hidden = jnp.maximum(hidden, 0) if index < count - 1 else jnp.tanh(hidden)
+        return hidden
+
+    shape = (*export.symbolic_shape("b"), layers["kernel_0"].shape[0])
+    exported = export.export(jax.jit(act), platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, jnp.float32))
+    return bytes(exported.serialize())
+
+
+def onnx_model(layers: dict[str, np.ndarray]) -> bytes:
+    """The same as an ONNX model with input `obs` [b, O] and output `action` [b, A]; no converter is needed for so few
+    operations."""
+    from onnx import TensorProto, checker, helper, numpy_helper
+
+    nodes, value, last = [], "obs", len(layers) // 2 - 1
+    for index in range(last + 1):
+        nodes.append(helper.make_node("Gemm", [value, f"kernel_{index}", f"bias_{index}"], [f"sum_{index}"]))
+        value = f"hidden_{index}" if index < last else "action"
+        nodes.append(helper.make_node("Relu" if index < last else "Tanh", [f"sum_{index}"], [value]))
+
+    def info(name: str, size: int) -> Any:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["b", size])
+
+    inputs, outputs = info("obs", layers["kernel_0"].shape[0]), info("action", len(layers[f"bias_{last}"]))
+    initial = [numpy_helper.from_array(np.ascontiguousarray(values), name) for name, values in layers.items()]
+    graph = helper.make_graph(nodes, "policy", [inputs], [outputs], initial)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+    checker.check_model(model)
+    return bytes(model.SerializeToString())
+
+
+def _save_bytes(content: bytes, path: Path) -> None:
+    path.write_bytes(content)
 
 
 def _save(layers: dict[str, np.ndarray], path: Path) -> None:

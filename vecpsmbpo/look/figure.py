@@ -264,7 +264,7 @@ def draw_states(experiment: Experiment) -> "Figure":
     rows = list(track(tasks, "UMAP", console=progress, transient=True, disable=not progress.is_terminal))
     for row, (task, found) in enumerate(rows):
         seen = [states.visited(one) for one in found]
-        places = states.plane(seen)
+        places = states.plane([one.obs for one in seen])
         everywhere = np.concatenate(places)
         for index, (one, place) in enumerate(zip(seen, places, strict=True)):
             last = one.steps.max() + 1

@@ -1,6 +1,6 @@
 """What a checkpoint holds of one lane: its policies and models, outside of the program that trained them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import posterior, sac
+from vecpsmbpo import imagination, posterior, replay, sac
 from vecpsmbpo.algorithms import Algorithm
+from vecpsmbpo.checkpoint import Saved
 from vecpsmbpo.drivers.common import evaluation_policies
-from vecpsmbpo.evaluate import restore
-from vecpsmbpo.look.runs import Run
+from vecpsmbpo.evaluate import restore, restore_each
+from vecpsmbpo.look.runs import Run, check_lane
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.types import SeedState
+from vecpsmbpo.types import Model, SeedState
 
 Array = np.ndarray
 Act = Callable[[Any], jax.Array]  # obs [..., O] -> mean action [..., A]
@@ -28,6 +29,7 @@ class Trained:
         step: environment steps when it was written.
         index: of the lane.
         state: of all lanes, leaves [S, ...].
+        imagined_rows: that every ring has received.
     """
 
     run: Run
@@ -35,6 +37,7 @@ class Trained:
     step: int
     index: int
     state: SeedState
+    imagined_rows: int
 
     def of_lane(self, tree: Any) -> Any:
         """The lane's part of leaves [S, ...]."""
@@ -48,8 +51,44 @@ class Trained:
 
     def actors(self) -> Any:
         """Parameters of every member's policy, leaves [N·M, ...]."""
-        places = self.algorithm.layout.places_of_members
-        return jax.tree.map(lambda x: x[places], self.of_lane(self.state.agents.actor))
+        return self._some(self._members, self.state.agents.actor)
+
+    def critics(self) -> tuple[Any, Array]:
+        """Parameters of every member's critics, leaves [N·M, ...], and its temperature α, [N·M]."""
+        agents = self.state.agents
+        return self._some(self._members, agents.critic), np.exp(np.asarray(self._some(self._members, agents.log_alpha)))
+
+    def models(self) -> Model | None:
+        """Leaves [N, ...]; None where none has been fitted yet."""
+        models: Model = self._some(np.arange(self.run.settings.n_models), self.state.models)
+        return models if np.asarray(models.optimizer.count).min() > 0 else None
+
+    def real_states(self, most: int, random: np.random.Generator) -> Array:
+        """[..., O], some of the observations that real steps of D_E led to."""
+        ring = self.state.real[self.index]
+        return self._observations(ring, random.permutation(min(self.step, len(ring)))[:most])
+
+    def imagined_states(self, most: int, random: np.random.Generator) -> Array | None:
+        """[..., O], some of the observations that imagined steps led to, of those that policies learn from now, of all
+        members; None where nothing is imagined."""
+        if not self.imagined_rows:
+            return None
+        rings, settings = self.state.imagined[self.index][self._members], self.run.settings
+        newest = min(self.imagined_rows, int(imagination.retained_rows(settings, jnp.int32(self.step))))
+        rows = (self.imagined_rows - 1 - random.integers(0, newest, most)) % rings.shape[1]
+        return self._observations(rings, (random.integers(0, len(rings), most), rows))
+
+    def _observations(self, ring: Any, place: Any) -> Array:
+        spec = self.algorithm.spec
+        return np.asarray(replay.unpack(ring[place], spec.obs_size, spec.action_size).next_obs)
+
+    @property
+    def _members(self) -> Array:
+        return self.algorithm.layout.places_of_members
+
+    def _some(self, places: Array, tree: Any) -> Any:
+        """The lane's models or members at `places`, on one device."""
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[places]), self.of_lane(tree))
 
     def best(self) -> int:
         """The member that has earned the most."""
@@ -62,11 +101,29 @@ def load(run: Run, lane: int = 0) -> Trained:
     Raises:
         SettingError: there is no checkpoint, or no such lane.
     """
-    settings = run.settings
-    if lane >= len(settings.lanes):
-        raise SettingError(f"lane={lane}: must be below {len(settings.lanes)}, the lanes of {run.path}")
-    driver, saved = restore(settings)
-    return Trained(run, driver.algorithm, saved.step, lane, saved.state.seeds)
+    check_lane(run, lane)
+    driver, saved = restore(run.settings)
+    return _trained(run, driver.algorithm, saved, lane)
+
+
+def load_each(run: Run, lane: int = 0, steps: Collection[int] = ()) -> Iterator[Trained]:
+    """As `load`, of every checkpoint that is kept and can be read, or of those at `steps`; oldest first.
+
+    Raises:
+        SettingError: there is none, or no such lane.
+    """
+    check_lane(run, lane)
+    found = False
+    for driver, saved in restore_each(run.settings, steps):
+        found = True
+        yield _trained(run, driver.algorithm, saved, lane)
+        del saved  # as in `restore_each`
+    if not found:
+        raise SettingError(f"run_dir={run.path}: holds no checkpoint yet")
+
+
+def _trained(run: Run, algorithm: Algorithm, saved: Saved, lane: int) -> Trained:
+    return Trained(run, algorithm, saved.step, lane, saved.state.seeds, int(saved.state.counters.imagined_rows))
 
 
 def acting(trained: Trained, member: str) -> list[tuple[str, Act]]:

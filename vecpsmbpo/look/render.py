@@ -1,4 +1,4 @@
-"""`vecpsmbpo render`: what trained policies do, drawn by the original simulator without a display."""
+"""`vecpsmbpo render`: what trained policies do, drawn without a display by the original simulator, if there is one."""
 
 import functools
 import importlib.util
@@ -15,8 +15,7 @@ from PIL import Image, ImageDraw
 from rich.console import Console
 from rich.progress import track
 
-from vecpsmbpo.envs import registry
-from vecpsmbpo.look import arguments, files, runs
+from vecpsmbpo.look import arguments, files, runs, stage
 from vecpsmbpo.look.runs import Run
 from vecpsmbpo.settings import SettingError
 
@@ -27,7 +26,8 @@ OPTIONS = {
     "member": arguments.text("best", "best, posterior, all, or n,m"),
     "lane": arguments.whole(0),
     "seed": arguments.whole(0),
-    "steps": arguments.whole(0),
+    "steps": arguments.wholes(),
+    "length": arguments.whole(0),
     "width": arguments.whole(0, at_least=64),
     "out": arguments.out("walk.mp4", ".mp4", ".gif", ".png"),
 }
@@ -65,8 +65,11 @@ def run(words: Sequence[str]) -> int:
     out = options["out"]
     files.check_writable(out)
     found = runs.load(path)
-    if "host" not in registry.TASKS[found.settings.env].backends:
-        raise SettingError(f"render: env={found.settings.env} has no simulator on the host that could draw it")
+    runs.check_lane(found, options["lane"])
+    kept = runs.kept_steps(found)
+    if missing := [step for step in options["steps"] if step not in kept]:
+        known = f"must be of {', '.join(map(str, kept))}, which checkpoints are kept of" if kept else "there is none"
+        raise SettingError(f"steps={missing[0]}: {known}")
     if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise SettingError(f"out={out}: .mp4 needs imageio-ffmpeg; pip install 'vecpsmbpo[video]', or take .gif")
     os.environ["MUJOCO_GL"] = platform()
@@ -106,10 +109,7 @@ def film(run: Run, options: dict[str, Any]) -> tuple[list[Array], float]:
     Raises:
         SettingError: as `members.load` and `members.acting`; the task cannot be drawn.
     """
-    from vecpsmbpo.look import members  # and JAX with it
-
-    trained = members.load(run, options["lane"])
-    policies = members.acting(trained, options["member"])
+    policies = _policies(run, options)
     width = options["width"] or (SINGLE if len(policies) == 1 else TILE)
     studio = Studio(run, [name for name, _ in policies], width, options["seed"])
     columns = 1 if options["out"].suffix.lower() == ".png" else int(np.ceil(np.sqrt(len(policies))))
@@ -119,97 +119,66 @@ def film(run: Run, options: dict[str, Any]) -> tuple[list[Array], float]:
         range(options["episodes"]), "drawing", console=console, transient=True, disable=not console.is_terminal
     )
     for _ in episodes:
-        for tiles in studio.episode([act for _, act in policies], options["steps"]):
+        for tiles in studio.episode([act for _, act in policies], options["length"]):
             frames.append(mosaic(tiles, columns))
     return frames, studio.frame_s
 
 
+def _policies(run: Run, options: dict[str, Any]) -> list[tuple[str, Callable[[Any], Any]]]:
+    """The members asked for, as they are now; or at `steps` of training one of them, as in figure 8.
+
+    Raises:
+        SettingError: as `members.load` and `members.acting`; several members at several steps.
+    """
+    from vecpsmbpo.look import members  # and JAX with it
+
+    who, steps = options["member"], options["steps"]
+    if not steps:
+        return members.acting(members.load(run, options["lane"]), who)
+    if who == "all":
+        raise SettingError("member=all: with steps= there is room for one member")
+    return [
+        (f"step {trained.step:,}", act)
+        for trained in members.load_each(run, options["lane"], steps)
+        for _, act in members.acting(trained, who)
+    ]
+
+
 class Studio:
-    """One simulator for each member, each with a camera."""
+    """One stage for each policy; all begin in the same state."""
 
     def __init__(self, run: Run, names: Sequence[str], width: int, seed: int):
         settings = run.settings
-        make = functools.partial(registry.make, settings.env, "host", num_envs=1, **dict(settings.env_options))
         self._names = names
-        self._envs = [make(seed=seed) for _ in names]
-        self._cameras = [camera(env.simulators[0], width) for env in self._envs]
-        for env in self._envs:
-            env.episode_length = settings.episode_length or env.spec.episode_length
-        self._dt = control_dt(self._envs[0].simulators[0])
-        self._every = max(1, round(1 / (FRAMES_PER_S * self._dt)))
+        self._stages = [stage.make(settings, width, seed) for _ in names]
+        self._every = max(1, round(1 / (FRAMES_PER_S * self._stages[0].dt)))
+        self._limit = settings.episode_length or self._stages[0].episode_length
 
     @property
     def frame_s(self) -> float:
         """Seconds between two frames."""
-        return self._every * self._dt
+        return self._every * self._stages[0].dt
 
-    def episode(self, policies: Sequence[Callable[[Any], Any]], steps: int = 0) -> Iterator[list[Tile]]:
-        """The tiles of every frame, until all episodes are over or `steps` are done (0: no limit)."""
-        observations = [env.reset() for env in self._envs]
-        tiles = [Tile(name, camera(), 0.0, False) for name, camera in zip(self._names, self._cameras, strict=True)]
+    def episode(self, policies: Sequence[Callable[[Any], Any]], length: int = 0) -> Iterator[list[Tile]]:
+        """The tiles of every frame, until all episodes are over or `length` steps are done (0: no limit)."""
+        observations = [one.reset() for one in self._stages]
+        tiles = [Tile(name, one.picture(), 0.0, False) for name, one in zip(self._names, self._stages, strict=True)]
         yield tiles
-        limit = steps or self._envs[0].episode_length
+        limit = min(length or self._limit, self._limit)
         for t in range(1, limit + 1):
-            for index, (env, act, tile) in enumerate(zip(self._envs, policies, tiles, strict=True)):
+            for index, (one, act, tile) in enumerate(zip(self._stages, policies, tiles, strict=True)):
                 if tile.over:
                     continue
-                step = env.step(np.asarray(act(observations[index])))
+                step = one.step(np.asarray(act(observations[index])))
                 observations[index] = step.obs
-                over = bool(step.terminated[0] | step.truncated[0])
-                # A simulator whose episode is over has been reset already: its last picture stays.
-                picture = self._cameras[index]() if t % self._every == 0 and not over else tile.picture
+                over = bool(step.terminated[0] | step.truncated[0]) or t == self._limit
+                # A simulator whose episode is over may have been reset already: its last picture stays.
+                picture = one.picture() if t % self._every == 0 and not over else tile.picture
                 tiles[index] = Tile(tile.name, picture, tile.earned + float(step.reward[0]), over)
             if t % self._every == 0:
                 yield tiles
             if all(tile.over for tile in tiles):
                 return
-
-
-def camera(simulator: Any, width: int) -> Callable[[], Array]:
-    """Draws what a simulator is in: [H, W, 3] uint8.
-
-    MuJoCo's own renderer where the simulator is one, from the task's first camera; else the environment's `render`.
-
-    Raises:
-        SettingError: it can do neither.
-    """
-    model, data = _mujoco(simulator)
-    if model is not None:
-        import mujoco
-
-        height = width * 3 // 4
-        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
-        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        renderer = mujoco.Renderer(model, height, width)
-        view = 0 if model.ncam else -1
-
-        def draw() -> Array:
-            renderer.update_scene(data, camera=view)
-            return renderer.render().copy()
-
-        return draw
-    env = getattr(simulator, "env", None)
-    if env is None or getattr(env, "render_mode", None) != "rgb_array":
-        raise SettingError("render: this environment cannot be drawn; give it render_mode='rgb_array'")
-    return lambda: np.asarray(env.render(), np.uint8)
-
-
-def _mujoco(simulator: Any) -> tuple[Any, Any]:
-    """Model and data of a MuJoCo simulator, or nothing."""
-    env = getattr(simulator, "env", None)
-    physics = getattr(env, "physics", None)
-    if physics is not None:  # the control suite
-        return physics.model.ptr, physics.data.ptr
-    core = getattr(env, "unwrapped", None)
-    return getattr(core, "model", None), getattr(core, "data", None)
-
-
-def control_dt(simulator: Any) -> float:
-    """Seconds of a control step; 1/30 where the simulator does not say."""
-    env = simulator.env
-    if hasattr(env, "control_timestep"):
-        return float(env.control_timestep())
-    return float(getattr(env.unwrapped, "dt", 1 / FRAMES_PER_S))
 
 
 def mosaic(tiles: Sequence[Tile], columns: int) -> Array:

@@ -3,15 +3,16 @@
 import shlex
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vecpsmbpo import config
-from vecpsmbpo.look import arguments, compare, files, groups, runs, statistics
+from vecpsmbpo.look import arguments, compare, diagnose, files, groups, runs, statistics
 from vecpsmbpo.look.curves import AXES, curve
 from vecpsmbpo.look.runs import METRICS_FILE, Lane, Run
 from vecpsmbpo.settings import FIELDS, SettingError, Settings
@@ -24,6 +25,7 @@ OPTIONS = {
     "group": arguments.names(),
     "videos": arguments.names(allowed="files that end in .mp4 or .gif, separated by commas"),
     "refresh": arguments.whole(0),
+    "diagnostics": arguments.choice("false", "true"),
 }
 PAGE = "report.html"  # in the directory of a run with report=true
 REFRESH_S = 30  # after which a browser looks for a newer one, while the run goes on
@@ -57,7 +59,15 @@ def run(words: Sequence[str]) -> int:
     files.check_writable(options["out"])
     films = [_film(name) for name in options["videos"]]
     found = runs.load_all(paths)
-    write(found, options["out"], group=options["group"], films=films, refresh_s=options["refresh"])
+    diagnoses = {run.path: diagnose.measure(run) for run in found} if options["diagnostics"] == "true" else {}
+    write(
+        found,
+        options["out"],
+        group=options["group"],
+        films=films,
+        refresh_s=options["refresh"],
+        diagnoses=diagnoses,
+    )
     for text in runs.warnings(found):
         print(f"vecpsmbpo: warning: {text}", file=sys.stderr)
     print(f"written: {options['out']}")
@@ -72,7 +82,13 @@ def _film(name: str) -> Path:
 
 
 def write(
-    found: Sequence[Run], out: Path, *, group: Sequence[str] = (), films: Sequence[Path] = (), refresh_s: int = 0
+    found: Sequence[Run],
+    out: Path,
+    *,
+    group: Sequence[str] = (),
+    films: Sequence[Path] = (),
+    refresh_s: int = 0,
+    diagnoses: Mapping[Path, dict[str, Any]] = MappingProxyType({}),
 ) -> None:
     """Writes the page of one run, or of several with a comparison first.
 
@@ -80,9 +96,10 @@ def write(
         group: as in `groups.group`.
         films: videos to put into it, besides those that lie in run directories.
         refresh_s: as in `page.Page`.
+        diagnoses: by run directory (`diagnose.measure`); of others, what lies in the directory.
 
     Raises:
-        SettingError: as `groups.group`, or it cannot be written.
+        SettingError: as `groups.group`, a diagnosis cannot be read, or the page cannot be written.
     """
     together = groups.group(found, group)
     from vecpsmbpo.look import style
@@ -95,7 +112,7 @@ def write(
         if len(found) > 1:
             _add_comparison(page, what, found, together)
         for one in found:
-            _add_run(page, one, heading="h1" if len(found) == 1 else "h2")
+            _add_run(page, one, "h1" if len(found) == 1 else "h2", diagnoses.get(one.path) or diagnose.read(one))
         _add_films(page, [*films, *(path for one in found for path in _own_films(one))])
     files.write_text(out, str(page))
 
@@ -149,7 +166,7 @@ def keep(run_dir: Path, warn: Callable[[str], None]) -> None:
 # ── one run ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _add_run(page: "Page", run: Run, heading: str) -> None:
+def _add_run(page: "Page", run: Run, heading: str, diagnosis: dict[str, Any] | None) -> None:
     from vecpsmbpo.look import page as html
 
     settings = run.settings
@@ -162,7 +179,18 @@ def _add_run(page: "Page", run: Run, heading: str) -> None:
     if max(len(one.lanes) for one in groups.group([run])) > 1:
         page.add('<p class="soft">Thick lines are means over seeds, thin ones the seeds.</p>')
     page.add("<h3>Inside</h3>", html.panels(filter(None, (*pictures, _chances_picture(page, run)))))
+    if diagnosis is not None:
+        _add_diagnosis(page, diagnosis)
     _add_settings(page, run)
+
+
+def _add_diagnosis(page: "Page", diagnosis: dict[str, Any]) -> None:
+    from vecpsmbpo.look import diagrams
+    from vecpsmbpo.look import page as html
+
+    pictures = [page.picture(figure, caption) for figure, caption in diagrams.figures(diagnosis)]
+    said = f'<p class="soft">{escape(diagrams.headline(diagnosis))}</p>'
+    page.add("<h3>Models and critics put to the test</h3>", said, html.panels(pictures))
 
 
 def _state(run: Run) -> str:

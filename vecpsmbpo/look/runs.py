@@ -66,7 +66,7 @@ class Lane:
     @cached_property
     def episodes(self) -> Columns:
         """Columns of episodes.jsonl, [E] each; `probs` [E, N·M]."""
-        return _where(self.run.episodes, self.values)
+        return self.run.of_lane(self.values)
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,10 @@ class Run:
         """Columns of episodes.jsonl of all lanes, [E] each; `probs` [E, N·M]."""
         return read(self.path / EPISODES_FILE).columns
 
+    def of_lane(self, values: Mapping[str, float]) -> Columns:
+        """`episodes` of the lane with this seed and these swept values."""
+        return _where(self.episodes, values)
+
     @property
     def env_steps(self) -> int:
         """How far it has come: the last whole epoch."""
@@ -124,6 +128,19 @@ def load(path: Path) -> Run:
         return Run(path, settings, read(path / METRICS_FILE, needed=("env_steps", *settings.lanes[0])))
     except OSError as error:
         raise SettingError(f"run_dir={path}: cannot be read ({error.strerror})") from None
+
+
+def kept_steps(run: Run) -> list[int]:
+    """Steps at which there is a checkpoint, oldest first."""
+    return sorted(int(path.name) for path in (run.path / "checkpoints").glob("*") if path.name.isdecimal())
+
+
+def check_lane(run: Run, lane: int) -> None:
+    """Raises:
+    SettingError: the run has no such lane.
+    """
+    if lane >= len(run.settings.lanes):
+        raise SettingError(f"lane={lane}: must be below {len(run.settings.lanes)}, the lanes of {run.path}")
 
 
 def load_all(paths: Iterable[Path]) -> list[Run]:

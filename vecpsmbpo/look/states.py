@@ -1,7 +1,7 @@
 """The states that runs of one task have visited, in a common plane (figures 8, 18 and 19)."""
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,13 +28,17 @@ class Visited(NamedTuple):
     obs: Array
 
 
+def has_umap() -> bool:
+    return importlib.util.find_spec("umap") is not None
+
+
 def check_umap() -> None:
     """Says so where the package is absent, before anything long begins.
 
     Raises:
         SettingError: it is.
     """
-    if importlib.util.find_spec("umap") is None:
+    if not has_umap():
         raise SettingError("figure: this one needs umap-learn; pip install 'vecpsmbpo[umap]'")
 
 
@@ -55,14 +59,27 @@ def visited(run: Run) -> Visited:
     return Visited(run, np.tile(steps, len(rings)), obs)
 
 
-def plane(states: Sequence[Visited]) -> list[Array]:
-    """UMAP of all states together, each coordinate in units of its deviation: [V, 2] for each."""
+def plane(clouds: Sequence[Array]) -> list[Array]:
+    """UMAP of all states together, each coordinate in units of its deviation: clouds [V, O] each -> [V, 2] each."""
     import umap
 
-    obs = np.concatenate([one.obs for one in states])
+    return _together(clouds, umap.UMAP(random_state=0, n_jobs=1).fit_transform)
+
+
+def principal_plane(clouds: Sequence[Array]) -> list[Array]:
+    """As `plane`, the first two principal components: nothing has to be installed for them."""
+
+    def first_two(obs: Array) -> Array:
+        _, _, axes = np.linalg.svd(obs, full_matrices=False)
+        places = obs @ axes[:2].T
+        return np.pad(places, ((0, 0), (0, 2 - places.shape[1])))
+
+    return _together(clouds, first_two)
+
+
+def _together(clouds: Sequence[Array], place: Callable[[Array], Array]) -> list[Array]:
+    """What `place` makes of all states, whitened, for each cloud."""
+    obs = np.concatenate(clouds)
     spread = obs.std(axis=0)
-    places = umap.UMAP(random_state=0, n_jobs=1).fit_transform(
-        (obs - obs.mean(axis=0)) / np.where(spread > 0, spread, 1)
-    )
-    ends = np.cumsum([len(one.obs) for one in states])
-    return np.split(places, ends[:-1])
+    places = place((obs - obs.mean(axis=0)) / np.where(spread > 0, spread, 1))
+    return np.split(places, np.cumsum([len(one) for one in clouds])[:-1])

@@ -51,7 +51,7 @@ class _Session:
     def __init__(self, settings: Settings, driver: Driver, shapes: TrainState, memory: str):
         self.settings, self.driver = settings, driver
         self.run_dir = Path(settings.run_dir)
-        self.checkpoints = checkpoint.Checkpoints(self.run_dir / "checkpoints")
+        self.checkpoints = checkpoint.Checkpoints(self.run_dir / "checkpoints", keep=settings.keep_checkpoints)
         saved = self.checkpoints.restore(shapes, driver.layout, warn=_warn)
         self.state = saved.state if saved else driver.init(*initial_inputs(settings))
         self.saved_step = saved.step if saved else None
@@ -60,7 +60,7 @@ class _Session:
             driver.load_env(saved.host["env"])
         self.env_steps = saved.step if saved else 0
         self.frozen = np.asarray(health.frozen(self.state.seeds.health))
-        self.log = metrics.RunLog(self.run_dir, self.env_steps, settings.lanes[0])
+        self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn)
         self.display = Display(driver.algorithm, self.env_steps)
         self.memory = memory
         self.epoch_began = time.perf_counter()

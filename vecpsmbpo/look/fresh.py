@@ -1,0 +1,126 @@
+"""Fresh episodes of the task that a run learned: what its models and critics are measured against."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from vecpsmbpo import envs
+from vecpsmbpo.envs.host.batched import HostEnv
+from vecpsmbpo.settings import Settings
+
+Array = np.ndarray
+# (step from 0, obs [E, O], key) -> actions [E, A] and their log-densities [E].
+Act = Callable[[int, Array, jax.Array], tuple[Any, Any]]
+
+
+class Episodes(NamedTuple):
+    """E episodes of up to T steps. What comes after an end is zero and not `there`.
+
+    Attributes:
+        obs, next_obs: [E, T, O].
+        action: [E, T, A].
+        log_prob: [E, T], of the actions taken.
+        reward: [E, T].
+        terminated: [E, T] bool, at the step that terminates.
+        there: [E, T] bool.
+    """
+
+    obs: Array
+    action: Array
+    log_prob: Array
+    reward: Array
+    next_obs: Array
+    terminated: Array
+    there: Array
+
+
+class Step(NamedTuple):
+    """next_obs [E, O], reward [E], terminated [E], truncated [E]; and obs [E, O] to go on from."""
+
+    next_obs: Array
+    reward: Array
+    terminated: Array
+    truncated: Array
+    obs: Array
+
+
+class World(Protocol):
+    """E environments of one task, stepped together."""
+
+    def reset(self) -> Array:
+        """[E, O]."""
+
+    def step(self, action: Array) -> Step: ...
+
+
+class MjxWorld:
+    """MJX environments. One whose episode is over goes on: nobody looks at it any more."""
+
+    def __init__(self, env: Any, count: int, seed: int):
+        self._keys = jax.random.split(jax.random.key(seed), count)
+        self._reset, self._step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+        self.state: Any = None  # leaves [E, ...]
+
+    def reset(self) -> Array:
+        self.state = self._reset(self._keys)
+        return np.asarray(self.state.obs)
+
+    def step(self, action: Array) -> Step:
+        self.state = self._step(self.state, action)
+        obs, reward, done = (np.asarray(x) for x in (self.state.obs, self.state.reward, self.state.done))
+        return Step(obs, reward, done > 0, np.zeros(len(done), bool), obs)
+
+
+class HostWorld:
+    """Simulators on the host."""
+
+    def __init__(self, env: HostEnv, length: int):
+        self._env = env
+        env.episode_length = length
+
+    def reset(self) -> Array:
+        return self._env.reset()
+
+    def step(self, action: Array) -> Step:
+        step = self._env.step(action)
+        return Step(step.next_obs, step.reward, step.terminated, step.truncated, step.obs)
+
+
+def world(settings: Settings, count: int, length: int, seed: int) -> World:
+    """`count` environments of a run's task on the run's backend, for episodes of up to `length` steps.
+
+    Raises:
+        SettingError: the task's suite is not installed.
+    """
+    env = envs.make(settings.env, settings.backend, num_envs=count, seed=seed, **dict(settings.env_options))
+    return MjxWorld(env, count, seed) if settings.backend == "mjx" else HostWorld(env, length)
+
+
+def collect(
+    world: World, act: Act, length: int, key: jax.Array, *, each: Callable[[Any], Any] = lambda steps: steps
+) -> Episodes:
+    """An episode of up to `length` steps in every environment.
+
+    Args:
+        each: shows progress over the steps, as `rich.progress.track` does.
+    """
+    obs, columns = world.reset(), []
+    alive = np.isfinite(obs).all(axis=-1)
+    for t in each(range(length)):
+        action, log_prob = (np.asarray(x) for x in act(t, np.nan_to_num(obs), jax.random.fold_in(key, t)))
+        step = world.step(action)
+        # A step that is not finite is not believed, and ends the episode before it.
+        alive = alive & np.isfinite(step.reward) & np.isfinite(step.next_obs).all(axis=-1)
+        taken = (obs, action, log_prob, step.reward, step.next_obs, step.terminated)
+        columns.append([*map(partial(_where, alive), taken), alive])
+        alive = alive & ~step.terminated & ~step.truncated
+        obs = step.obs
+    return Episodes(*(np.stack(column, axis=1) for column in zip(*columns, strict=True)))
+
+
+def _where(alive: Array, values: Array) -> Array:
+    """Zero where not `alive` [E]."""
+    return np.where(alive.reshape(-1, *[1] * (values.ndim - 1)), values, 0).astype(values.dtype)
