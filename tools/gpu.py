@@ -1,0 +1,160 @@
+"""All that a GPU has to show, in order of worth, each part with a limit of its own; half an hour in all on an H100.
+
+    tools/gpu                          every part, from the first
+    tools/gpu hopper_stable updates    these
+    tools/gpu minutes=9                so long, all parts together: what is left goes on at the next call
+    tools/gpu size=tiny                on any machine, in minutes: that the script itself works
+    tools/gpu out=results/gpu          where the figures go (the default); the runs themselves lie in out/runs
+
+A part that trains stops at its limit with a checkpoint and goes on from there; a part that measures is done once, and
+again where its file in `out` is removed. Each part leaves `<part>.json` (the command, the machine, what came out), and
+one that trains its curve besides, `<part>.csv`.
+"""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vecpsmbpo import metrics, versions
+
+HERE = Path(__file__).resolve().parent
+SAVING_S = 90  # that a run is given to save after it was asked to stop
+TINY = {"size": "tiny", "total_steps": "80", "epoch_steps": "40", "replay_capacity": "1000"}
+
+
+@dataclass(frozen=True)
+class Part:
+    """A command, and how long it may take.
+
+    Attributes:
+        words: of `vecpsmbpo train` where it trains, else of the tool that it names first.
+        trains: whether it is a run.
+    """
+
+    name: str
+    minutes: float
+    words: tuple[str, ...]
+    trains: bool = False
+
+
+# The original simulator steps: on an H100 a step of MJX costs 10 ms, of C MuJoCo 0.05 (results/gpu/bench_envs.jsonl).
+PAPER = ("env=hopper", "backend=host", "total_steps=40000", "seed=0")
+PARTS = (
+    Part("hopper_stable", 9, (*PAPER, "recipe=stable"), trains=True),
+    Part("hopper_paper", 9, (*PAPER, "recipe=paper"), trains=True),
+    Part("updates", 2, ("bench.py", "updates", "n_models=5", "n_policies=5")),
+    Part("updates_of_ten_seeds", 2, ("bench.py", "updates", "n_models=5", "n_policies=5", "num_seeds=10")),
+    Part("steps", 3, ("bench.py", "envs", "hopper", "ant")),
+    Part("parity", 2, ("parity.py", "hopper", "states=500", "episodes=5")),
+    Part("ant_stable", 9, ("env=ant", "backend=host", "total_steps=40000", "seed=0", "recipe=stable"), trains=True),
+)
+
+
+def main(arguments: list[str]) -> int:
+    options = {"out": "results/gpu", "size": "paper", "minutes": "30"}
+    options |= dict(word.split("=", 1) for word in arguments if "=" in word)
+    wanted = [word for word in arguments if "=" not in word] or [part.name for part in PARTS]
+    unknown = [*(set(wanted) - {part.name for part in PARTS}), *(set(options) - {"out", "size", "minutes"})]
+    if unknown or options["size"] not in ("paper", "tiny") or not options["minutes"].replace(".", "", 1).isdigit():
+        names = " ".join(part.name for part in PARTS)
+        print(f"gpu: takes out=, size=paper|tiny, minutes=, and of these parts: {names}", file=sys.stderr)
+        return 2
+    out, tiny = Path(options["out"]), options["size"] == "tiny"
+    out.mkdir(parents=True, exist_ok=True)
+    ends = time.monotonic() + 60 * float(options["minutes"])
+    failed = 0
+    for part in PARTS:
+        if part.name not in wanted:
+            continue
+        seconds = min(60 * part.minutes, ends - time.monotonic())
+        if seconds < SAVING_S and not tiny:
+            print(f"{part.name}: no time left; call this again", flush=True)
+            continue
+        done = (train if part.trains else measure)(part, out, seconds, tiny)
+        print(f"{part.name}: {done}", flush=True)
+        failed |= done.startswith("FAILED")
+    return int(failed)
+
+
+def train(part: Part, out: Path, seconds: float, tiny: bool) -> str:
+    """Begins or goes on with a run; what became of it."""
+    run_dir = out / "runs" / part.name
+    words = dict(word.split("=", 1) for word in part.words) | (TINY if tiny else {})
+    settings = [f"{name}={value}" for name, value in words.items()]
+    command = [sys.executable, "-m", "vecpsmbpo.cli", "train", *settings, f"run_dir={run_dir}"]
+    began = time.monotonic()
+    process = subprocess.Popen(command, stdout=sys.stderr)
+    try:
+        status = process.wait(max(seconds - SAVING_S, 1) if not tiny else None)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)
+        status = process.wait()
+    lines = metrics.read(run_dir / metrics.METRICS_FILE)
+    if not lines:
+        return f"FAILED with status {status}"
+    last = lines[-1]
+    evaluated = [line["eval_return"] for line in lines if line["eval_return"] is not None]
+    keep(
+        part,
+        out,
+        command,
+        {
+            "status": status,
+            "env_steps": last["env_steps"],
+            "seconds": last["seconds"],
+            "seconds_of_this_call": time.monotonic() - began,
+            "eval_return_of_the_last_five": sum(evaluated[-5:]) / len(evaluated[-5:]),
+            "best_eval_return": max(evaluated),
+            "env_steps_per_s": last["env_steps_per_s"],
+            "updates_per_s": last["updates_per_s"],
+            "compile_seconds": last["compile_seconds"],
+        },
+    )
+    curve = [sys.executable, "-m", "vecpsmbpo.cli", "plot", str(run_dir), f"out={out / part.name}.csv"]
+    drawn = subprocess.run(curve, stdout=sys.stderr, check=False)
+    stopped = status == 128 + signal.SIGINT
+    if drawn.returncode or (status and not stopped):
+        return f"FAILED with status {status}"
+    return f"{last['env_steps']} steps, {'to go on' if stopped else 'whole'}; return {last['eval_return']:.4g}"
+
+
+def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
+    """Runs a tool once; what became of it."""
+    if (out / f"{part.name}.json").exists():
+        return "was measured before"
+    tool, *words = part.words
+    if tiny and tool == "bench.py" and words[0] == "updates":
+        words = ["updates", "size=tiny", *(word for word in words if word.startswith("num_seeds"))]
+    if tool == "parity.py":
+        words.append(f"output={out / part.name}.csv")
+    command = [sys.executable, str(HERE / tool), *words]
+    try:
+        done = subprocess.run(command, stdout=subprocess.PIPE, timeout=seconds, text=True, check=False)
+    except subprocess.TimeoutExpired:
+        return f"FAILED: took longer than {seconds:.0f} s"
+    if done.returncode:
+        return f"FAILED with status {done.returncode}"
+    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    keep(part, out, command, {"found": found})
+    return f"{len(found)} lines"
+
+
+def keep(part: Part, out: Path, command: list[str], found: dict[str, Any]) -> None:
+    """Writes a part's file."""
+    import jax
+
+    about = {
+        "command": " ".join(["python", *command[1:]]),
+        **versions.current(),
+        "device": jax.devices()[0].device_kind,
+    }
+    (out / f"{part.name}.json").write_text(json.dumps({**about, **found}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
