@@ -14,7 +14,7 @@ from tests.helpers import algorithm, environment, initial, tiny
 from vecpsmbpo import sac
 from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs import specs
-from vecpsmbpo.layout import Layout, _copies, _mesh_shape
+from vecpsmbpo.layout import MEMBER_WORK, Layout, _copies, _mesh_shape
 from vecpsmbpo.types import Counters, TrainState
 
 SPEC = specs.get("ball_in_cup")
@@ -155,8 +155,8 @@ def test_saving_rings_leaves_them_to_be_overwritten_in_place():
     ],
 )
 def test_the_mesh_gives_the_busiest_device_least_to_do(lanes, models, members, most, shape):
-    found = _mesh_shape(lanes, models, members, most)
-    work = lambda s, m: lanes // s * (-(-models // m) + -(-members // m))  # noqa: E731
+    found = _mesh_shape(lanes, models, members, most, lambda shards: 1)
+    work = lambda s, m: lanes // s * (-(-models // m) + MEMBER_WORK * -(-members // m))  # noqa: E731
     assert lanes % found[0] == 0
     assert work(*found) == work(*shape)
     assert found[0] * found[1] <= shape[0] * shape[1] <= most
@@ -172,6 +172,9 @@ def test_the_mesh_gives_the_busiest_device_least_to_do(lanes, models, members, m
         (1, 1, 1, 255, 2, (1, 1), 1),  # rows that cannot be halved
         (1, 2, 2, 256, 4, (1, 4), 2),
         (1, 2, 2, 256, 3, (1, 2), 1),
+        (1, 5, 1, 256, 3, (1, 2), 2),  # two that learn are worth more than three that fit models
+        (1, 5, 1, 256, 6, (1, 4), 4),
+        (1, 1, 1, 256, 64, (1, 8), 8),
     ],
 )
 def test_devices_without_a_member_of_their_own_share_one(lanes, models, members, batch, most, shape, copies):
@@ -181,7 +184,7 @@ def test_devices_without_a_member_of_their_own_share_one(lanes, models, members,
 
 def test_a_member_that_devices_share_equals_one_on_one_device():
     """Gradients of the parts of a minibatch, averaged, are those of the minibatch."""
-    settings = tiny(n_models=1, n_policies=1, devices=1)
+    settings = tiny(n_models=1, n_policies=1, devices=1, policy_batch_size=64)
     alone = learned(settings, Layout.of(settings))
     layout = Layout.of(dataclasses.replace(settings, devices=2))
     assert (layout.copies, layout.padded_members) == (2, 2)

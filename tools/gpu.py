@@ -11,6 +11,7 @@ again where its file in `out` is removed. Each part leaves `<part>.json` (the co
 one that trains its curve besides, `<part>.csv`.
 """
 
+import csv
 import json
 import signal
 import subprocess
@@ -24,6 +25,7 @@ from vecpsmbpo import metrics, versions
 
 HERE = Path(__file__).resolve().parent
 SAVING_S = 90  # that a run is given to save after it was asked to stop
+INTERRUPTED = 128 + signal.SIGINT
 TINY = {"size": "tiny", "total_steps": "80", "epoch_steps": "40", "replay_capacity": "1000"}
 
 
@@ -50,7 +52,7 @@ PARTS = (
     Part("updates", 2, ("bench.py", "updates", "n_models=5", "n_policies=5")),
     Part("updates_of_ten_seeds", 2, ("bench.py", "updates", "n_models=5", "n_policies=5", "num_seeds=10")),
     Part("steps", 3, ("bench.py", "envs", "hopper", "ant")),
-    Part("parity", 2, ("parity.py", "hopper", "states=500", "episodes=5")),
+    Part("parity", 2, ("parity.py", "hopper", "states=500", "episodes=5")),  # leaves parity_again.csv
     Part("ant_stable", 9, ("env=ant", "backend=host", "total_steps=40000", "seed=0", "recipe=stable"), trains=True),
 )
 
@@ -92,13 +94,11 @@ def train(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     try:
         status = process.wait(max(seconds - SAVING_S, 1) if not tiny else None)
     except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGINT)
-        status = process.wait()
-    lines = metrics.read(run_dir / metrics.METRICS_FILE)
+        status = stopped(process)
+    lines = [line for line in metrics.read(run_dir / metrics.METRICS_FILE) if line["eval_return"] is not None]
     if not lines:
-        return f"FAILED with status {status}"
-    last = lines[-1]
-    evaluated = [line["eval_return"] for line in lines if line["eval_return"] is not None]
+        return "to go on, before its first epoch" if status == INTERRUPTED else f"FAILED with status {status}"
+    last, evaluated = lines[-1], [line["eval_return"] for line in lines]
     keep(
         part,
         out,
@@ -117,10 +117,20 @@ def train(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     )
     curve = [sys.executable, "-m", "vecpsmbpo.cli", "plot", str(run_dir), f"out={out / part.name}.csv"]
     drawn = subprocess.run(curve, stdout=sys.stderr, check=False)
-    stopped = status == 128 + signal.SIGINT
-    if drawn.returncode or (status and not stopped):
+    if drawn.returncode or status not in (0, INTERRUPTED):
         return f"FAILED with status {status}"
-    return f"{last['env_steps']} steps, {'to go on' if stopped else 'whole'}; return {last['eval_return']:.4g}"
+    left = "to go on" if status else "whole"
+    return f"{last['env_steps']} steps, {left}; return {last['eval_return']:.4g}"
+
+
+def stopped(process: subprocess.Popen) -> int:
+    """Asks a run to save and end, and ends it where it does not; its exit status."""
+    process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(SAVING_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
 
 
 def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
@@ -130,8 +140,9 @@ def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     tool, *words = part.words
     if tiny and tool == "bench.py" and words[0] == "updates":
         words = ["updates", "size=tiny", *(word for word in words if word.startswith("num_seeds"))]
+    table = out / f"{part.name}_again.csv"  # parity.csv is the whole one
     if tool == "parity.py":
-        words.append(f"output={out / part.name}.csv")
+        words.append(f"output={table}")
     command = [sys.executable, str(HERE / tool), *words]
     try:
         done = subprocess.run(command, stdout=subprocess.PIPE, timeout=seconds, text=True, check=False)
@@ -140,6 +151,9 @@ def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     if done.returncode:
         return f"FAILED with status {done.returncode}"
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    if tool == "parity.py":
+        with table.open() as file:
+            found = list(csv.DictReader(file))
     keep(part, out, command, {"found": found})
     return f"{len(found)} lines"
 

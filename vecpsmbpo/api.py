@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import config, dynamics, loggers
+from vecpsmbpo import config, dynamics
 from vecpsmbpo.algorithms import Algorithm
 from vecpsmbpo.evaluate import evaluate
 from vecpsmbpo.look import members, runs
@@ -63,6 +63,8 @@ class DynamicsModel:
 class Run:
     """A run directory: its logs, and what its newest checkpoint holds of one lane.
 
+    Logs are read whenever they are asked for; `policy` and `models` stay what they were when first asked for.
+
     Attributes:
         run_dir: where it lies.
         settings: that it was started with.
@@ -111,8 +113,9 @@ class Run:
 
     # ── the newest checkpoint ────────────────────────────────────────────────────────────────────────────────────
 
-    @cached_property
+    @property
     def _trained(self) -> members.Trained:
+        # Loaded anew each time and not kept: it holds all rings, of which neither a policy nor a model needs any.
         return members.load(runs.load(self.run_dir), self.lane)
 
     @cached_property
@@ -130,11 +133,14 @@ class Run:
         """The N dynamics models.
 
         Raises:
-            SettingError: there is no checkpoint.
+            SettingError: there is no checkpoint, or no model has been fitted yet (`algo=sac` has none).
         """
-        models = self._trained.of_lane(self._trained.state.models)
+        trained = self._trained
+        models = trained.models()
+        if models is None:
+            raise SettingError(f"run_dir={self.run_dir}: no model has been fitted yet")
         one = [jax.tree.map(lambda x, n=n: x[n], models) for n in range(self.settings.n_models)]
-        return [DynamicsModel(model, self._trained.algorithm) for model in one]
+        return [DynamicsModel(model, trained.algorithm) for model in one]
 
     def evaluate(self, **how: Any) -> Table:
         """Whole episodes of all lanes in environments of their own: a row per episode.
@@ -160,10 +166,9 @@ def train(**settings: Any) -> Run:
 
     Raises:
         SettingError: a mistake in the settings, in one line.
-        DiskError: the run directory cannot be written.
+        training.DiskError: the run directory cannot be written.
     """
     resolved = config.resolve(config.overrides_of(settings))
-    loggers.check(resolved.loggers)
     run_training(resolved)
     return Run(resolved.run_dir)
 

@@ -109,7 +109,8 @@ class Checkpoints:
                 return Saved(step, _from_host(items["state"], shapes, layout), items["host"])
         if reason is not None:
             what = (str(reason).strip() or repr(reason)).splitlines()[0][:200]
-            raise SettingError(f"{self._directory}: holds checkpoints, but none that can be read ({what})")
+            which = "holds checkpoints, but none that can be read" if at is None else f"cannot be read at step {at}"
+            raise SettingError(f"{self._directory}: {which} ({what})")
         return None
 
     def _read(self, step: int, shapes: TrainState, layout: Layout) -> Any:

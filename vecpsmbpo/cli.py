@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from vecpsmbpo import crash, loggers
+from vecpsmbpo import crash
 from vecpsmbpo.settings import SettingError, Settings
 
 HELP = """\
@@ -91,7 +91,6 @@ def _train(overrides: list[str]) -> int:
 
 
 def _run(settings: Settings) -> int:
-    loggers.check(settings.loggers)
     from vecpsmbpo.training import DiskError, train
 
     try:

@@ -16,6 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from vecpsmbpo import loggers
 from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, Settings, allowed, build, check, check_sweep
 
@@ -209,8 +210,14 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None) -> Setting
         tree: what Hydra composed of them, where it already has (a job of a multirun).
 
     Raises:
-        SettingError: a mistake in `overrides`, or one contradicts the stored run.
+        SettingError: a mistake in `overrides`, one contradicts the stored run, or a logger is not installed.
     """
+    settings = _resolved(overrides, tree)
+    loggers.check(settings.loggers)
+    return settings
+
+
+def _resolved(overrides: Sequence[str], tree: DictConfig | None) -> Settings:
     given = parse(overrides, sweep=tree is not None)
 
     def new() -> Settings:

@@ -107,8 +107,8 @@ def predict_with_any(
 ) -> dynamics.Successor:
     """For every row a model drawn anew, as in MBPO and in TS1 of PETS.
 
-    Rows are shuffled and cut into N parts: each row's model is uniform, whatever it was a step before, and a row costs
-    one model and not N.
+    Rows are shuffled and cut into N parts: each row's model is drawn whatever it was a step before, uniformly as far as
+    N divides B (else the last part is a few rows smaller), and a row costs one model and not N.
 
     Args:
         predict: of one model.

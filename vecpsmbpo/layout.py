@@ -26,6 +26,9 @@ from vecpsmbpo.types import SeedState, TrainState
 SEEDS, MEMBERS = "seeds", "members"
 _BY_SEED, _BY_MEMBER = PartitionSpec(SEEDS), PartitionSpec(SEEDS, MEMBERS)
 
+MEMBER_WORK = 4  # of a member's updates, in fits of a model: about what hopper at the paper's size takes
+LEAST_PART = 32  # rows of a minibatch, below which its gradients take no longer than to average them
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -58,7 +61,8 @@ class Layout:
         devices = jax.devices()
         most = min(settings.devices or len(devices), len(devices))
         on_cpu = devices[0].platform == "cpu"
-        copies = partial(_copies, settings.n_members, settings.policy_batch_size if on_cpu else 1)
+        splits = on_cpu and not (settings.alternates or settings.plans)
+        copies = partial(_copies, settings.n_members, settings.policy_batch_size if splits else 1)
         shape = _mesh_shape(len(settings.lanes), settings.n_models, settings.n_members, most, copies)
         grid = np.array(devices[: math.prod(shape)]).reshape(shape)
         return cls(
@@ -312,6 +316,7 @@ class Layout:
             part = np.zeros((len(places), *like.shape[-2:]), like.dtype)
             for row, place in zip(part, places, strict=True):
                 if (index := number(place)) is not None:
+                    assert saved[index] is not None, "devices come in the order of their places"
                     row[:] = saved[index]
                     if not of_members or (place[1] + 1) % self.copies == 0:  # the last that shares it
                         saved[index] = None
@@ -339,9 +344,7 @@ def _making_empty_arrays(function: Callable) -> Callable:
     return body
 
 
-def _mesh_shape(
-    lanes: int, models: int, members: int, most: int, copies: Callable[[int], int] = lambda shards: 1
-) -> tuple[int, int]:
+def _mesh_shape(lanes: int, models: int, members: int, most: int, copies: Callable[[int], int]) -> tuple[int, int]:
     """Devices over seeds and over members, up to `most` together: such that the busiest has least to do, and no more of
     them than that takes.
 
@@ -353,7 +356,7 @@ def _mesh_shape(
 
     def work(seeds: int, shards: int) -> float:
         of_members = -(-members * copies(shards) // shards) / copies(shards)
-        return lanes // seeds * (-(-models // shards) + of_members)
+        return lanes // seeds * (-(-models // shards) + MEMBER_WORK * of_members)
 
     shapes = [(s, m) for s in range(1, most + 1) if lanes % s == 0 for m in range(1, most // s + 1)]
     return min(shapes, key=lambda shape: (work(*shape), math.prod(shape), shape[1]))
@@ -361,9 +364,9 @@ def _mesh_shape(
 
 def _copies(members: int, batch: int, shards: int) -> int:
     """How many of the `shards` devices share a member: all that there are to each, if they can cut its minibatches of
-    `batch` rows into equal parts."""
+    `batch` rows into equal parts that are worth it."""
     shared = shards // members
-    return shared if shards == members * shared and batch % shared == 0 else 1
+    return shared if shards == members * shared and batch % shared == 0 and batch // shared >= LEAST_PART else 1
 
 
 def _view(x: Any) -> np.ndarray:

@@ -51,9 +51,9 @@ def check(names: Iterable[str]) -> None:
     """
     for name in names:
         if importlib.util.find_spec(PACKAGES[name]) is None:
+            extra = PACKAGES[name] if name == "tensorboard" else f"'vecpsmbpo[{name}]'"
             raise SettingError(
-                f"loggers=[{name}]: needs the package {PACKAGES[name]}; "
-                f"pip install 'vecpsmbpo[{name}]', or leave it out"
+                f"loggers=[{name}]: needs the package {PACKAGES[name]}; pip install {extra}, or leave it out"
             )
 
 
@@ -82,7 +82,7 @@ class Loggers:
         if name == "tensorboard":
             return TensorBoard(self._run_dir, env_steps)
         kinds: dict[str, Callable[..., Logger]] = {"wandb": Wandb, "mlflow": Mlflow}
-        return Remote(lambda: kinds[name](settings, self._run_dir), lambda error: self._drop(name, error))
+        return Remote(lambda: kinds[name](settings, self._run_dir, env_steps), lambda error: self._drop(name, error))
 
     def scalars(self, values: Values, env_steps: int) -> None:
         for name in self._loggers:
@@ -177,7 +177,7 @@ class Remote:
 class Wandb:
     """Weights & Biases: one run for the run directory. Without a key it writes what `wandb sync` sends later."""
 
-    def __init__(self, settings: Settings, run_dir: Path):
+    def __init__(self, settings: Settings, run_dir: Path, env_steps: int):
         import wandb
 
         self._wandb = wandb
@@ -193,7 +193,7 @@ class Wandb:
             config=hyperparameters(settings),
             settings=wandb.Settings(silent=True, console="off", disable_git=True),
         )
-        self._env_steps = 0
+        self._env_steps = env_steps
 
     def scalars(self, values: Values, env_steps: int) -> None:
         # W&B's steps only rise, over all sessions of a run; what belongs to one step is one row.
@@ -216,7 +216,7 @@ class Wandb:
 class Mlflow:
     """MLflow: one run for the run directory, at the tracking server that MLFLOW_TRACKING_URI names."""
 
-    def __init__(self, settings: Settings, run_dir: Path):
+    def __init__(self, settings: Settings, run_dir: Path, env_steps: int):
         from mlflow import MlflowClient
         from mlflow.entities import Metric
 

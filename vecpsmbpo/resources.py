@@ -97,13 +97,14 @@ def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any)
     if state + working + program > free:
         raise SettingError(
             f"not enough memory: {words}, but {free / GIB:.2f} GiB are free; lower imagined_capacity, "
-            "replay_capacity, n_models, n_policies or num_seeds"
+            "replay_capacity, n_models, n_policies, num_seeds or devices"
         )
     return f"{words}, of {free / GIB:.1f} GiB free"
 
 
-def check_disk(directory: Path, state: TrainState, env_steps: int) -> None:
-    """Whether there is room for a checkpoint at `env_steps`: parameters whole, buffers as far as they are filled then.
+def check_disk(directory: Path, state: TrainState, env_steps: int, layout: Layout) -> None:
+    """Whether there is room for a checkpoint at `env_steps`: parameters whole, buffers as far as they are filled then,
+    each member once.
 
     Asked before writing, since orbax's threads report a disk that fills under them in a page of tracebacks.
 
@@ -117,7 +118,10 @@ def check_disk(directory: Path, state: TrainState, env_steps: int) -> None:
     seeds, counters = state.seeds, state.counters
     later = env_steps > int(counters.env_steps)
     imagined = seeds.imagined.shape[-2] if later else int(counters.imagined_rows)
-    needed = CHECKPOINT_OVERHEAD + filled(seeds.real, env_steps) + filled(seeds.imagined, imagined)
-    needed += sum(leaf.nbytes for leaf in jax.tree.leaves((seeds.models, seeds.agents)))
+    of_members = filled(seeds.imagined, imagined) + sum(leaf.nbytes for leaf in jax.tree.leaves(seeds.agents))
+    needed = (
+        CHECKPOINT_OVERHEAD + filled(seeds.real, env_steps) + of_members * layout.n_members // layout.padded_members
+    )
+    needed += sum(leaf.nbytes for leaf in jax.tree.leaves(seeds.models))
     if shutil.disk_usage(directory).free < needed:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

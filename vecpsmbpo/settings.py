@@ -256,7 +256,7 @@ def check(name: str, value: Any) -> Any:
             raise complaint
         return value
     if field.type == tuple[str, ...]:
-        if not isinstance(value, list | tuple) or not set(value) <= set(field.metadata["choices"]):
+        if not isinstance(value, list | tuple) or any(item not in field.metadata["choices"] for item in value):
             raise complaint
         return tuple(dict.fromkeys(value))
     if field.type == tuple[float, ...]:

@@ -19,25 +19,33 @@ if TYPE_CHECKING:
 ROOT = "MINARI_DATASETS_PATH"  # where Minari keeps its data sets, an environment variable of its own
 
 
-def write(trained: "Trained", folder: Path) -> Path:
-    """Writes the lane's finished episodes, as far as D_E still has them, below `folder`, a root of Minari's.
+def collect(trained: "Trained", folder: Path) -> list[Any]:
+    """The lane's finished episodes, as far as D_E still has them, to be written below `folder`.
+
+    Raises:
+        SettingError: there is a data set already, or no finished episode.
+    """
+    if (folder / _name(trained)).exists():
+        raise SettingError(f"out={folder / _name(trained)}: is there already")
+    buffers = list(_buffers(trained))
+    if not buffers:
+        raise SettingError(f"run_dir={trained.run.path}: has no finished episode to export")
+    return buffers
+
+
+def write(trained: "Trained", buffers: list[Any], folder: Path) -> Path:
+    """Writes what `collect` found below `folder`, a root of Minari's.
 
     Returns:
         The data set's own directory.
 
     Raises:
-        SettingError: there is one there already, or it has no finished episode, or it cannot be written.
+        SettingError: it cannot be written.
     """
     import gymnasium
     import minari
 
-    spec, run = trained.algorithm.spec, trained.run
-    name = f"vecpsmbpo/{re.sub('[^A-Za-z0-9_-]', '_', run.settings.task)}-v0"
-    if (folder / name).exists():
-        raise SettingError(f"out={folder / name}: is there already")
-    buffers = list(_buffers(trained))
-    if not buffers:
-        raise SettingError(f"run_dir={run.path}: has no finished episode to export")
+    spec, run, name = trained.algorithm.spec, trained.run, _name(trained)
     spaces = {
         "observation_space": gymnasium.spaces.Box(-np.inf, np.inf, (spec.obs_size,), np.float32),
         "action_space": gymnasium.spaces.Box(-1.0, 1.0, (spec.action_size,), np.float32),
@@ -55,6 +63,10 @@ def write(trained: "Trained", folder: Path) -> Path:
     except OSError as error:
         raise SettingError(f"out={folder}: cannot be written ({error.strerror or error})") from None
     return folder / name
+
+
+def _name(trained: "Trained") -> str:
+    return f"vecpsmbpo/{re.sub('[^A-Za-z0-9_-]', '_', trained.run.settings.task)}-v0"
 
 
 @contextlib.contextmanager
@@ -86,14 +98,17 @@ def _buffers(trained: "Trained") -> Iterator[Any]:
         rows = np.arange(int(end - length), int(end))
         if end > trained.step or rows[0] < trained.step - len(ring):
             continue
-        obs, action, reward, next_obs, _ = replay.unpack(
-            jnp.asarray(ring[rows % len(ring)]), spec.obs_size, spec.action_size
+        obs, action, reward, next_obs, _ = map(
+            np.asarray, replay.unpack(jnp.asarray(ring[rows % len(ring)]), spec.obs_size, spec.action_size)
         )
+        if len(rows) > 1 and not np.array_equal(obs[-1], next_obs[-2]):
+            # The simulator returned something that is not finite, and D_E holds the row before it once more.
+            rows, obs, action, reward, next_obs = (x[:-1] for x in (rows, obs, action, reward, next_obs))
         last = np.arange(len(rows)) == len(rows) - 1
         yield EpisodeBuffer(
-            observations=np.concatenate([np.asarray(obs), np.asarray(next_obs[-1:])]),
-            actions=np.asarray(action),
-            rewards=np.asarray(reward),
+            observations=np.concatenate([obs, next_obs[-1:]]),
+            actions=action,
+            rewards=reward,
             terminations=last & bool(terminated),
             truncations=last & (not terminated),
         )

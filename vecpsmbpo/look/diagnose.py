@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 Array = np.ndarray
 
 FILE = "diagnostics.json"  # in a run's directory, where `report` finds it
+PARTS = ("task", "lane", "episodes", "env_steps", "models", "critics", "states", "history")  # of it, that are drawn
 OPTIONS = {
     "episodes": arguments.whole(1, at_least=1),
     "horizon": arguments.whole(50, at_least=1),
@@ -81,7 +82,7 @@ def read(run: Run) -> dict[str, Any] | None:
         return None
     try:
         found = json.loads(path.read_text())
-        return {"history": found["history"], **found}
+        return {**{name: found[name] for name in PARTS}, **found}
     except (OSError, ValueError, KeyError, TypeError):
         raise SettingError(f"{path}: cannot be read; vecpsmbpo diagnose {run.path} writes it again") from None
 
@@ -141,6 +142,7 @@ class _Probe:
         from vecpsmbpo.look import fresh
 
         key = jax.random.key(self._seed)
+        self._world.rewind()
         act = _members_act(trained, self._each) if trained.has_members else _evaluation_act(trained, self._each)
         seen = fresh.collect(self._world, act, self._steps, key, each=partial(_shown, f"step {trained.step:,}"))
         random = np.random.default_rng(self._seed)

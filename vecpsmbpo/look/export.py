@@ -32,7 +32,7 @@ OPTIONS = {
 }
 
 FILES = ("policy.npz", "act.py", "policy.json")
-ADDITIONS = {"jax": "flatbuffers", "onnx": "onnx", "minari": "minari"}  # and the package that each needs
+ADDITIONS = {"jax": ("flatbuffers",), "onnx": ("onnx",), "minari": ("minari", "h5py")}  # and what each needs
 OPSET, IR_VERSION = 17, 8  # of ONNX, from 2022: every runtime since then reads it
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 ACT = '''\
@@ -82,6 +82,7 @@ def run(words: Sequence[str]) -> int:
     from vecpsmbpo.look import members
 
     trained = members.load(found, options["lane"])
+    episodes = dataset.collect(trained, out / "minari") if "minari" in options["also"] else []
     layers = export(trained, out, options["member"])
     written = [out / name for name in FILES]
     for name, make in (("jax", jax_function), ("onnx", onnx_model)):
@@ -89,7 +90,7 @@ def run(words: Sequence[str]) -> int:
             written.append(out / f"policy.{name}")
             files.write(written[-1], functools.partial(_save_bytes, make(layers)))
     if "minari" in options["also"]:
-        written.append(dataset.write(trained, out / "minari"))
+        written.append(dataset.write(trained, episodes, out / "minari"))
     print(f"written: {', '.join(map(str, written))}")
     return 0
 
@@ -100,8 +101,9 @@ def _check_extra(name: str) -> None:
     """
     if name not in ADDITIONS:
         raise SettingError(f"also={name}: must be {OPTIONS['also'].allowed}")
-    if importlib.util.find_spec(ADDITIONS[name]) is None:
-        raise SettingError(f"also={name}: needs the package {ADDITIONS[name]}; pip install 'vecpsmbpo[export]'")
+    for package in ADDITIONS[name]:
+        if importlib.util.find_spec(package) is None:
+            raise SettingError(f"also={name}: needs the package {package}; pip install 'vecpsmbpo[export]'")
 
 
 def export(trained: "Trained", out: Path, member: str) -> dict[str, np.ndarray]:

@@ -53,6 +53,9 @@ class World(Protocol):
     def reset(self) -> Array:
         """[E, O]."""
 
+    def rewind(self) -> None:
+        """The next reset begins as the first did, where starts can be chosen."""
+
     def step(self, action: Array) -> Step: ...
 
 
@@ -60,12 +63,17 @@ class MjxWorld:
     """MJX environments. One whose episode is over goes on: nobody looks at it any more."""
 
     def __init__(self, env: Any, count: int, seed: int):
-        self._keys = jax.random.split(jax.random.key(seed), count)
+        self._seed, self._count = seed, count
+        self.rewind()
         self._reset, self._step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
         self.state: Any = None  # leaves [E, ...]
 
+    def rewind(self) -> None:
+        self._key = jax.random.key(self._seed)
+
     def reset(self) -> Array:
-        self.state = self._reset(self._keys)
+        self._key, key = jax.random.split(self._key)  # episodes that follow one another begin differently
+        self.state = self._reset(jax.random.split(key, self._count))
         return np.asarray(self.state.obs)
 
     def step(self, action: Array) -> Step:
@@ -83,6 +91,9 @@ class HostWorld:
 
     def reset(self) -> Array:
         return self._env.reset()
+
+    def rewind(self) -> None:
+        pass
 
     def step(self, action: Array) -> Step:
         step = self._env.step(action)

@@ -80,7 +80,7 @@ class _Session:
                     return self._status
                 self.log.session({"env_steps": self.env_steps, **versions.current(), "devices": self._devices()})
                 # At once, and not after hours.
-                resources.check_disk(self.run_dir, self.state, settings.total_steps)
+                resources.check_disk(self.run_dir, self.state, settings.total_steps, self.driver.layout)
                 if self.saved_step is None:
                     self._save()
                 self._compile()
@@ -235,7 +235,7 @@ class _Session:
 
     def _save(self) -> None:
         if self.saved_step != self.env_steps:
-            resources.check_disk(self.run_dir, self.state, self.env_steps)
+            resources.check_disk(self.run_dir, self.state, self.env_steps, self.driver.layout)
             host = {"env": self.driver.save_env(), "seconds": self.watch()}
             self.checkpoints.save(self.env_steps, self.state, host, self.driver.layout)
             self.saved_step = self.env_steps
