@@ -16,7 +16,7 @@ from vecpsmbpo.drivers.common import split_for_episodes
 from vecpsmbpo.training.programs import evaluation_keys, initial_inputs
 
 DISCOUNT = 0.5
-STEPS = 600
+STEPS = 1000  # after 600, Q is still 0.14 below its limit (mean over ten seeds), after these 0.06
 
 
 def settings_for(**changes):

@@ -17,7 +17,7 @@ from vecpsmbpo.settings import SettingError
 class Recorder:
     """A logger that keeps what it is told; of a class that a test may bend."""
 
-    def __init__(self, settings, run_dir):
+    def __init__(self, settings, run_dir, env_steps):
         self.told, self.sent, self.closed = [], [], False
         self.threads = {threading.current_thread()}
         self.id = loggers._id(run_dir, "wandb", lambda: "made")

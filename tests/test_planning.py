@@ -137,9 +137,9 @@ def test_a_run_plans_well(kind):
     lines = metrics.episode_lines(news, 0, settings)
     np.testing.assert_array_equal(state.seeds.memory, 0)  # an episode has just ended; its plan is forgotten
     planned = [line["return"] for line in lines if not line["random"]]
-    assert np.mean(planned[-10:]) > 0.85
+    assert np.mean(planned[-10:]) > 0.8  # uniform actions: 2/3
     assert {(line["model"], line["policy"], len(line["probs"])) for line in lines} == {(0, 0, 1)}
-    assert (driver.evaluate(state, evaluation_keys(settings, 0), 2).episode_return > 0.85).all()
+    assert (driver.evaluate(state, evaluation_keys(settings, 0), 2).episode_return > 0.8).all()
     line = metrics.epoch_lines(state, settings)[0]
     assert line["critic_loss"] is None
     assert line["model_val_mse"] < 0.1
