@@ -111,16 +111,17 @@ def test_place_is_the_inverse_of_unpad():
             np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize(("seeds", "models"), [(1, 3), (2, 3)])
+@pytest.mark.parametrize(("seeds", "models"), [(1, 3), (2, 3), (1, 1)])
 def test_rings_come_back_from_the_host(seeds, models):
-    """Padded members (3 on 2 devices) do not reach the host; seeds on 2 devices are put together again."""
-    settings = tiny(n_models=models, n_policies=1, num_seeds=seeds, devices=2)
+    """Padded members (3 on 2 devices) do not reach the host, a shared one (1 on 2) does once; seeds on 2 devices are
+    put together again."""
+    settings = tiny(n_models=models, n_policies=1, num_seeds=seeds, devices=2, policy_batch_size=64)
     layout = Layout.of(settings)
     seeds_state = initial(algorithm(settings, SPEC))
     for name, members in (("real", None), ("imagined", models)):
         empty, spec = getattr(seeds_state, name), getattr(layout.specs().seeds, name)
         values = np.random.default_rng(0).normal(size=empty.shape).astype(np.float32)
-        rings = layout.rings_to_host(jax.device_put(values, empty.sharding), members)
+        rings = layout.rings_to_host(jax.device_put(values, empty.sharding))
         expected = values if members is None else values[:, :members]
         np.testing.assert_array_equal(np.reshape(rings, expected.shape), expected)
         again = layout.rings_from_host(rings, empty, spec)
@@ -135,7 +136,7 @@ def test_saving_rings_leaves_them_to_be_overwritten_in_place():
     ring = initial(algorithm(tiny(devices=2), SPEC)).imagined
     shards = lambda x: [shard.data.unsafe_buffer_pointer() for shard in x.addressable_shards]  # noqa: E731
     before = shards(ring)
-    assert len(layout.rings_to_host(ring, 4)) == 4
+    assert len(layout.rings_to_host(ring)) == 4
     after = jax.jit(lambda x: x.at[..., 0].set(1.0), donate_argnums=0, out_shardings=ring.sharding)(ring)
     assert shards(after) == before
 

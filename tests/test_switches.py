@@ -204,7 +204,7 @@ def test_the_bandit_follows_the_best_arm_when_it_changes():
 
 
 def run(kind="scan", **changes):
-    settings = settings_for(updates_per_step=1, epoch_steps=120, **changes)
+    settings = settings_for(updates_per_step=1, total_steps=600, epoch_steps=120, **changes)
     driver = make_driver(kind, True, settings)
     state, lines, epochs = driver.init(*initial_inputs(settings)), [], []
     for epoch in range(settings.total_steps // settings.epoch_steps):

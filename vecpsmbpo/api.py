@@ -81,9 +81,9 @@ class Run:
             SettingError: there is no run, or no such lane.
         """
         self.run_dir, self.lane = Path(run_dir), lane
-        self.settings = config.load(self.run_dir)
-        if not 0 <= lane < len(self.settings.lanes):
-            raise SettingError(f"lane={lane}: must be below {len(self.settings.lanes)}, the lanes of {run_dir}")
+        found = runs.load(self.run_dir)
+        runs.check_lane(found, lane)
+        self.settings = found.settings
 
     def __repr__(self) -> str:
         one = self.settings

@@ -132,7 +132,7 @@ class Checkpoints:
 def _to_host(state: TrainState, layout: Layout) -> dict[str, Any]:
     rest = jax.tree.map(lambda x: np.asarray(_storable(x)), layout.unpad(state.without_rings()))
     real = layout.rings_to_host(state.seeds.real)
-    imagined = layout.rings_to_host(state.seeds.imagined, layout.n_members)
+    imagined = layout.rings_to_host(state.seeds.imagined)
     return {"rest": rest, "real": real, "imagined": imagined}
 
 

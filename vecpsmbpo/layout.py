@@ -271,8 +271,8 @@ class Layout:
 
     # rings on the host: gigabytes at the paper's size, which must not be copied to be saved
 
-    def rings_to_host(self, rings: jax.Array, members: int | None = None) -> list[np.ndarray]:
-        """Each ring [C, F] of [S, C, F], or of the first `members` in [S, P, C, F], by itself.
+    def rings_to_host(self, rings: jax.Array) -> list[np.ndarray]:
+        """Each ring [C, F] of [S, C, F], or of the N·M members in [S, P, C, F], by itself.
 
         Views, where the host's memory is the device's.
         """
@@ -282,10 +282,8 @@ class Layout:
             where: Any = shard.index
             for inside, place in zip(np.ndindex(part.shape[:-2]), _places(where[:-2], rings.shape), strict=True):
                 by_place[place] = part[inside]
-        if members is None:
-            return [by_place[seed,] for seed in range(self.num_seeds)]
-        places = self.places_of_members[:members]
-        return [by_place[seed, int(place)] for seed in range(self.num_seeds) for place in places]
+        members = [self.places_of_members.tolist()] if rings.ndim == 4 else []
+        return [by_place[place] for place in itertools.product(range(self.num_seeds), *members)]
 
     def rings_from_host(self, saved: list[Any], like: Any, spec: PartitionSpec) -> jax.Array:
         """The inverse of `rings_to_host`, laid out on the mesh; padding members get empty rings.

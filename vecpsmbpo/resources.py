@@ -119,9 +119,7 @@ def check_disk(directory: Path, state: TrainState, env_steps: int, layout: Layou
     later = env_steps > int(counters.env_steps)
     imagined = seeds.imagined.shape[-2] if later else int(counters.imagined_rows)
     of_members = filled(seeds.imagined, imagined) + sum(leaf.nbytes for leaf in jax.tree.leaves(seeds.agents))
-    needed = (
-        CHECKPOINT_OVERHEAD + filled(seeds.real, env_steps) + of_members * layout.n_members // layout.padded_members
-    )
-    needed += sum(leaf.nbytes for leaf in jax.tree.leaves(seeds.models))
+    needed = CHECKPOINT_OVERHEAD + of_members * layout.n_members // layout.padded_members
+    needed += filled(seeds.real, env_steps) + sum(leaf.nbytes for leaf in jax.tree.leaves(seeds.models))
     if shutil.disk_usage(directory).free < needed:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

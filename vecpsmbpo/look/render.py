@@ -137,11 +137,11 @@ def _policies(run: Run, options: dict[str, Any]) -> list[tuple[str, Callable[[An
         return members.acting(members.load(run, options["lane"]), who)
     if who == "all":
         raise SettingError("member=all: with steps= there is room for one member")
-    return [
-        (f"step {trained.step:,}", act)
-        for trained in members.load_each(run, options["lane"], steps)
-        for _, act in members.acting(trained, who)
-    ]
+    found = []
+    for trained in members.load_each(run, options["lane"], steps):
+        found += [(f"step {trained.step:,}", act) for _, act in members.acting(trained, who)]
+        del trained  # as in `evaluate.restore_each`
+    return found
 
 
 class Studio:

@@ -139,7 +139,7 @@ def check_lane(run: Run, lane: int) -> None:
     """Raises:
     SettingError: the run has no such lane.
     """
-    if lane >= len(run.settings.lanes):
+    if not 0 <= lane < len(run.settings.lanes):
         raise SettingError(f"lane={lane}: must be below {len(run.settings.lanes)}, the lanes of {run.path}")
 
 
