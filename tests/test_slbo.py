@@ -10,7 +10,8 @@ from jax.flatten_util import ravel_pytree
 from tests.helpers import tiny
 from tests.test_drivers import make_driver
 from tests.test_imagination import constant
-from vecpsmbpo import dynamics, metrics, multistep, networks, replay, trpo
+from vecpsmbpo import dynamics, metrics, replay
+from vecpsmbpo.algorithms.slbo import multistep, networks, trpo
 from vecpsmbpo.envs import specs
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.training.programs import evaluation_keys, initial_inputs

@@ -1,9 +1,9 @@
-"""One file per algorithm over the functions of `base.Algorithm`."""
+"""A folder per algorithm over the functions of `base.Algorithm`."""
 
 from vecpsmbpo.algorithms.base import Algorithm
-from vecpsmbpo.algorithms.pets import Pets
-from vecpsmbpo.algorithms.ps_mbpo import PsMbpo
-from vecpsmbpo.algorithms.slbo import Slbo
+from vecpsmbpo.algorithms.pets.algorithm import Pets
+from vecpsmbpo.algorithms.ps_mbpo.algorithm import PsMbpo
+from vecpsmbpo.algorithms.slbo.algorithm import Slbo
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EnvSpec

@@ -1,4 +1,4 @@
-"""SLBO (Luo et al., 2019) for one seed: one model and one policy, which learn in turns at every refresh."""
+"""SLBO for one seed: model and policy learn in turns at every refresh."""
 
 from functools import partial
 from typing import Any
@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import dynamics, imagination, multistep, trpo
+from vecpsmbpo import dynamics, imagination
 from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.algorithms.slbo import multistep, trpo
 from vecpsmbpo.types import Counters, Model, Params, Scaling, SeedState
 
 

@@ -8,7 +8,8 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 from jax.scipy.sparse.linalg import cg
 
-from vecpsmbpo import networks, optim
+from vecpsmbpo import optim
+from vecpsmbpo.algorithms.slbo import networks
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import AgentStats, EnvSpec, Params
 

@@ -1,4 +1,4 @@
-"""PETS (Chua et al., 2018) for one seed: no policy; every action is planned in the N models."""
+"""PETS for one seed: model-predictive control in the N models."""
 
 from typing import Any
 
@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import planning
 from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.algorithms.pets import planning
 from vecpsmbpo.types import AgentStats, Counters, Model, Planner, SeedState
 
 

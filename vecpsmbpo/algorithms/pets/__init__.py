@@ -1,0 +1,1 @@
+"""PETS (Chua et al., 2018): no policy; every action is planned in the N models."""

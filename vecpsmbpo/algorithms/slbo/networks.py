@@ -1,0 +1,85 @@
+"""SLBO's networks: TRPO's policy and value function."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from vecpsmbpo.types import Params
+
+
+class TanhMLP(nn.Module):
+    """Dense layers with tanh between them, and a linear output that begins near 0."""
+
+    output_size: int
+    hidden_size: int
+    hidden_layers: int
+
+    @nn.compact
+    def __call__(self, hidden: jax.Array) -> jax.Array:
+        for _ in range(self.hidden_layers):
+            hidden = nn.tanh(nn.Dense(self.hidden_size, kernel_init=nn.initializers.orthogonal(2**0.5))(hidden))
+        return nn.Dense(self.output_size, kernel_init=nn.initializers.orthogonal(0.01))(hidden)
+
+
+class Normal(NamedTuple):
+    """Independent normals per action; loc and log_std [..., A]."""
+
+    loc: jax.Array
+    log_std: jax.Array
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        return self.loc + jnp.exp(self.log_std) * jax.random.normal(key, self.loc.shape)
+
+    def log_prob(self, action: jax.Array) -> jax.Array:
+        """[...]."""
+        scaled = (action - self.loc) * jnp.exp(-self.log_std)
+        return jnp.sum(-0.5 * scaled**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
+
+    def entropy(self) -> jax.Array:
+        """[...]."""
+        return jnp.sum(jnp.broadcast_to(self.log_std, self.loc.shape) + 0.5 * jnp.log(2 * jnp.pi * jnp.e), axis=-1)
+
+    def divergence_to(self, other: "Normal") -> jax.Array:
+        """KL(self || other), [...]."""
+        ratio = jnp.exp(2 * (self.log_std - other.log_std))
+        distance = ((self.loc - other.loc) * jnp.exp(-other.log_std)) ** 2
+        return 0.5 * jnp.sum(ratio + distance - 1 - 2 * (self.log_std - other.log_std), axis=-1)
+
+
+class GaussianPolicy(nn.Module):
+    """π(a | s), normal with a standard deviation that does not depend on the state; actions are clipped to be taken."""
+
+    action_size: int
+    hidden_size: int
+    hidden_layers: int
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> Normal:
+        """obs [..., O] -> law of actions [..., A]."""
+        loc = TanhMLP(self.action_size, self.hidden_size, self.hidden_layers)(obs)
+        log_std = self.param("log_std", nn.initializers.constant(-0.5), (self.action_size,))
+        return Normal(loc, jnp.broadcast_to(log_std, loc.shape))
+
+    def law(self, params: Params, obs: jax.Array) -> Normal:
+        """π(· | obs) of these parameters."""
+        law: Any = self.apply(params, obs)
+        return law
+
+
+class StateValue(nn.Module):
+    """V(s)."""
+
+    hidden_size: int
+    hidden_layers: int
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        """obs [..., O] -> [...]."""
+        return TanhMLP(1, self.hidden_size, self.hidden_layers)(obs)[..., 0]
+
+    def values(self, params: Params, obs: jax.Array) -> jax.Array:
+        """V [...] of these parameters."""
+        values: Any = self.apply(params, obs)
+        return values
