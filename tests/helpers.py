@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from vecpsmbpo import algorithms, config, metrics
+from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.training.programs import initial_inputs
@@ -37,7 +38,7 @@ def algorithm(settings: Settings, spec: EnvSpec) -> Any:
     return algorithms.make(settings, spec)
 
 
-def initial(algorithm: algorithms.Algorithm) -> SeedState:
+def initial(algorithm: Algorithm) -> SeedState:
     """The state of all seeds before the first step."""
     specs = algorithm.layout.specs().seeds
     init = algorithm.layout.spread(jax.vmap(algorithm.init), (specs.key, specs.key), specs)

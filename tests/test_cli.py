@@ -16,8 +16,10 @@ import vecpsmbpo
 from tests.helpers import command, environment
 from tests.test_setup import DM_CONTROL
 from vecpsmbpo import cli, config
+from vecpsmbpo.algorithms import TABLE
+from vecpsmbpo.algorithms.catalogue import FIELDS, allowed, check, of_algorithm
 from vecpsmbpo.envs.registry import TASKS
-from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, allowed, check
+from vecpsmbpo.settings import CHANGEABLE, SettingError
 
 MISTAKES = [
     (["train", "env=hoper"], "env=hoper: did you mean hopper"),
@@ -37,11 +39,19 @@ MISTAKES = [
     (["train", "compile_cache=maybe"], "compile_cache=maybe: must be true or false"),
     (["train", "total_steps=1500"], "total_steps=1500: must be a multiple of epoch_steps=1000"),
     (["train", "model_update_every=300"], "model_update_every=300: must divide epoch_steps=1000"),
-    (["train", "algo=slbo", "posterior=average"], "posterior=average: there are no policies to average"),
+    (
+        ["train", "algo=slbo", "posterior=average"],
+        "posterior: algo=slbo has no such setting; algo=ops_mbpo or",
+    ),
     (["train", "algo=sac", "real_ratio=0.5"], "real_ratio: must be 1 with algo=sac"),
-    (["train", "algo=pets", "sweep.real_ratio=[0,1]"], "real_ratio: must be 0 with algo=pets"),
+    (["train", "algo=pets", "sweep.real_ratio=[0,1]"], "sweep.real_ratio: algo=pets has no such setting"),
+    (["train", "plan_horizon=3"], "plan_horizon: algo=ops_mbpo has no such setting; algo=pets has"),
+    (["train", "-m", "algo=pets,mbpo", "plan_horizon=3"], "plan_horizon: algo=mbpo has no such setting; algo=pets has"),
     (["train", "algo=sac", "n_models=5"], "n_models=5: must be 1 with algo=sac"),
-    (["train", "algo=pets", "n_policies=2"], "n_policies=2: must be 1 with algo=pets"),
+    (
+        ["train", "algo=pets", "n_policies=2"],
+        "n_policies: algo=pets has no such setting; algo=ops_mbpo or",
+    ),
     (["train", "real_ratio_schedule=linear", "sweep.real_ratio=[0,1]"], "sweep.real_ratio: needs real_ratio_schedule"),
     (["train", "real_ratio_arms=[0.3,0.1]"], "real_ratio_arms=[0.3, 0.1]: must rise"),
     (["train", "real_ratio_schedule=bandit", "posterior=average"], "posterior=average: no policy earns"),
@@ -141,10 +151,12 @@ def test_a_run_directory_that_cannot_be_written(tmp_path):
 
 
 def test_every_setting_has_a_default_and_says_what_it_may_be():
-    settings = config.compose([])
-    for name in FIELDS:
-        assert allowed(name)
-        assert check(name, getattr(settings, name)) == getattr(settings, name)
+    for algo in TABLE:
+        settings = config.compose([f"algo={algo}"])
+        for name, field in of_algorithm(algo).items():
+            assert allowed(name)
+            assert check(name, getattr(settings, name)) == getattr(settings, name)
+            assert (field.type, field.metadata) == (FIELDS[name].type, FIELDS[name].metadata)  # one name, one meaning
     assert set(FIELDS) >= CHANGEABLE
 
 

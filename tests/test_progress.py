@@ -3,7 +3,7 @@
 import pytest
 
 from tests.helpers import algorithm, tiny
-from vecpsmbpo.algorithms import Algorithm
+from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.progress import Pace, Rates, duration
 from vecpsmbpo.types import EnvSpec
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vecpsmbpo import config, dynamics
-from vecpsmbpo.algorithms import Algorithm
+from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.evaluate import evaluate
 from vecpsmbpo.look import members, runs
 from vecpsmbpo.settings import SettingError, Settings

@@ -170,7 +170,7 @@ def _help() -> str:
     from importlib import resources
 
     from vecpsmbpo import config
-    from vecpsmbpo.settings import FIELDS
+    from vecpsmbpo.algorithms.catalogue import FIELDS
 
     plain = [name for name in FIELDS if name not in config.GROUPS]
     return HELP.format(

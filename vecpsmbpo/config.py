@@ -17,8 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from vecpsmbpo import loggers
+from vecpsmbpo.algorithms.catalogue import FIELDS, allowed, build, check, check_sweep, require
 from vecpsmbpo.envs import registry
-from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError, Settings, allowed, build, check, check_sweep
+from vecpsmbpo.settings import CHANGEABLE, SettingError, Settings
 
 CONFIG_FILE = "config.yaml"
 GROUPS = ("env", "algo", "size", "recipe")
@@ -60,6 +61,7 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
         SettingError: what is wrong with the first wrong one.
     """
     found: dict[str, Any] = {}
+    algorithms: list[str] = []
     for text in overrides:
         if "=" not in text:
             raise SettingError(f"{text}: must be name=value")
@@ -75,9 +77,13 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
         values = _sweep_values(override) if override.is_sweep_override() else [override.value()]
         for value in values:
             found[name] = _check_override(name, value)
+            algorithms += [str(value)] if name == "algo" else []
     if "experiment" in found and not sweep:
         raise SettingError(f"experiment={found['experiment']}: is a grid of runs and needs -m")
     _check_env_options(found)
+    if sweep and "experiment" not in found:
+        for algo in algorithms or [_default("algo")]:
+            _check_algorithm(algo, found)
     return found
 
 
@@ -93,9 +99,18 @@ def _check_env_options(found: dict[str, Any]) -> None:
             raise SettingError(f"{name}: no such option of env={env}; it has {has}")
 
 
-def _defaults() -> dict[str, Any]:
-    """What `configs/config.yaml` says."""
-    return yaml.safe_load((resources.files("vecpsmbpo.configs") / "config.yaml").read_text())
+def _check_algorithm(algo: str, names: Iterable[str]) -> None:
+    """That the algorithm has the settings given."""
+    for name in names:
+        require(algo, name)
+
+
+def _defaults(algo: str = "") -> dict[str, Any]:
+    """What `configs/config.yaml` says, and for the settings that only this algorithm has, `configs/algo/settings`."""
+    folder = resources.files("vecpsmbpo.configs")
+    found = yaml.safe_load((folder / "config.yaml").read_text())
+    own = folder / "algo" / "settings" / f"{algo}.yaml"
+    return {**found, **(yaml.safe_load(own.read_text()) if own.is_file() else {})}
 
 
 def _default(group: str) -> str:
@@ -131,7 +146,8 @@ def compose(overrides: Sequence[str]) -> Settings:
     Raises:
         SettingError: a mistake in `overrides`.
     """
-    parse(overrides)
+    given = parse(overrides)
+    _check_algorithm(given.get("algo", _default("algo")), given)
     try:
         with hydra.initialize_config_module("vecpsmbpo.configs", version_base="1.3"):
             tree = hydra.compose("config", for_hydra(overrides))
@@ -152,6 +168,7 @@ def from_tree(tree: DictConfig, overrides: Sequence[str]) -> Settings:
     values["env_options"] = {name: value for name, value in values["env"].items() if name != "name"}
     for group in GROUPS:
         values[group] = values[group]["name"]
+    _check_algorithm(values["algo"], (text.split("=")[0].lstrip("+") for text in overrides))
     for name, value in values["env_options"].items():
         if value == "???":
             raise SettingError(f"env.{name}: must be given with env={values['env']}")
@@ -195,7 +212,8 @@ def load(run_dir: str | Path) -> Settings:
     try:
         stored = yaml.safe_load(path.read_text())
         # What the run does not know came to this program after it, and is off by default.
-        return dataclasses.replace(build({**_defaults(), "recipe": "paper", **stored}), run_dir=str(run_dir))
+        values = {**_defaults(stored["algo"]), "recipe": "paper", **stored}
+        return dataclasses.replace(build(values), run_dir=str(run_dir))
     except OSError:
         raise SettingError(f"run_dir={run_dir}: holds no {CONFIG_FILE}, so no run") from None
     except (KeyError, TypeError, yaml.YAMLError) as error:
@@ -227,7 +245,8 @@ def _resolved(overrides: Sequence[str], tree: DictConfig | None) -> Settings:
     if not (Path(run_dir) / CONFIG_FILE).exists():
         return new()
     stored = load(run_dir)
-    changed = {}
+    _check_algorithm(stored.algo, given)
+    changed: dict[str, Any] = {}
     for name, value in given.items():
         if name == "experiment":  # a name for a grid; what it sets has been given beside it
             continue
@@ -235,7 +254,7 @@ def _resolved(overrides: Sequence[str], tree: DictConfig | None) -> Settings:
         had = dict(getattr(stored, _DOTTED[group])).get(option) if group else getattr(stored, name)
         if name == "run_dir" or value == had or (name, value) == ("backend", "auto"):
             continue
-        if name not in CHANGEABLE or (name == "total_steps" and stored.real_ratio_schedule == "linear"):
+        if name not in CHANGEABLE or (name == "total_steps" and getattr(stored, "real_ratio_schedule", "") == "linear"):
             raise SettingError(
                 f"{name}={value}: contradicts the run in {run_dir}, which has {name}={had}; "
                 "leave it out to resume, or give another run_dir"

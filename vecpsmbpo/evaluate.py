@@ -94,7 +94,7 @@ def _opened(stored: Settings) -> Iterator[tuple[Driver, TrainState, checkpoint.C
     runtime.configure(stored)
     driver = make_driver(stored)
     shapes = driver.shapes(*initial_inputs(stored))
-    resources.check_memory(stored, driver.algorithm.spec, driver.layout, shapes)
+    resources.check_memory(driver.algorithm, shapes)
     checkpoints = checkpoint.Checkpoints(Path(stored.run_dir) / "checkpoints", read_only=True)
     try:
         yield driver, shapes, checkpoints

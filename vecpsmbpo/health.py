@@ -109,5 +109,5 @@ def describe(seeds: SeedState, lane: int, settings: Settings) -> str:
     if part == MODELS:
         return f"{name} of model n = {index}"
     if part == AGENTS:
-        return f"{name} of policy n = {index // settings.n_policies}, m = {index % settings.n_policies}"
+        return f"{name} of policy n = {index // settings.policies_per_model}, m = {index % settings.policies_per_model}"
     return name

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 
 from vecpsmbpo import dynamics, replay, sac
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings.parts import ImaginationSettings
 from vecpsmbpo.types import EnvSpec, Model, Params, Transition
 
 LARGEST_CHUNK = 4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
 
 
-def chunk_size(settings: Settings) -> int:
+def chunk_size(settings: ImaginationSettings) -> int:
     """Start states rolled out together: an even part of `rollout_starts`, and at most as many as the ring can hold the
     longest rollouts of."""
     starts = settings.rollout_starts
@@ -24,11 +24,11 @@ def chunk_size(settings: Settings) -> int:
     return starts // parts
 
 
-def longest_horizon(settings: Settings) -> int:
+def longest_horizon(settings: ImaginationSettings) -> int:
     return max(settings.horizon_first, settings.horizon_last)
 
 
-def ring_capacity(settings: Settings) -> int:
+def ring_capacity(settings: ImaginationSettings) -> int:
     """C_M: what one epoch can imagine for a member at the longest horizon, up to `imagined_capacity`.
 
     A multiple of the chunk, so that a block of rows never wraps. At a shorter horizon it would hold many epochs: see
@@ -39,7 +39,7 @@ def ring_capacity(settings: Settings) -> int:
     return max(min(wanted, settings.imagined_capacity) // chunk, 1) * chunk
 
 
-def horizon(settings: Settings, env_steps: jax.Array) -> jax.Array:
+def horizon(settings: ImaginationSettings, env_steps: jax.Array) -> jax.Array:
     """Table 1's schedule x → y over epochs a → b: ⌊clip(x + (k - a) / (b - a) · (y - x))⌋.
 
     k counts whole epochs of 1000 environment steps, whatever `epoch_steps` is.
@@ -51,7 +51,7 @@ def horizon(settings: Settings, env_steps: jax.Array) -> jax.Array:
     return jnp.floor(jnp.clip(value, min(first, last), max(first, last))).astype(jnp.int32)
 
 
-def chunks_per_refresh(settings: Settings, horizon: jax.Array) -> jax.Array:
+def chunks_per_refresh(settings: ImaginationSettings, horizon: jax.Array) -> jax.Array:
     """How many chunks of start states one refresh rolls out.
 
     When starts × horizon would exceed the ring, there are fewer starts; a rollout is never cut short.
@@ -60,13 +60,13 @@ def chunks_per_refresh(settings: Settings, horizon: jax.Array) -> jax.Array:
     return jnp.clip(ring_capacity(settings) // (horizon * chunk), 1, settings.rollout_starts // chunk)
 
 
-def rows_per_refresh(settings: Settings, env_steps: jax.Array) -> jax.Array:
+def rows_per_refresh(settings: ImaginationSettings, env_steps: jax.Array) -> jax.Array:
     """How many transitions one refresh imagines for each member."""
     now = horizon(settings, env_steps)
     return chunks_per_refresh(settings, now) * now * chunk_size(settings)
 
 
-def retained_rows(settings: Settings, env_steps: jax.Array) -> jax.Array:
+def retained_rows(settings: ImaginationSettings, env_steps: jax.Array) -> jax.Array:
     """How many of the newest rows policies learn from after `env_steps` steps: those of one epoch of refreshes.
 
     As both MBPO codebases have it: older rows come from models fitted on less data and from policies of long ago. Each
@@ -81,7 +81,7 @@ def retained_rows(settings: Settings, env_steps: jax.Array) -> jax.Array:
 
 
 def step(
-    model: Model, actor: Params, obs: jax.Array, key: jax.Array, *, settings: Settings, spec: EnvSpec
+    model: Model, actor: Params, obs: jax.Array, key: jax.Array, *, settings: ImaginationSettings, spec: EnvSpec
 ) -> Transition:
     """One imagined step of one member for a batch of states.
 

@@ -61,15 +61,14 @@ class Layout:
         devices = jax.devices()
         most = min(settings.devices or len(devices), len(devices))
         on_cpu = devices[0].platform == "cpu"
-        splits = on_cpu and not (settings.alternates or settings.plans)
-        copies = partial(_copies, settings.n_members, settings.policy_batch_size if splits else 1)
+        copies = partial(_copies, settings.n_members, settings.minibatch if on_cpu else 1)
         shape = _mesh_shape(len(settings.lanes), settings.n_models, settings.n_members, most, copies)
         grid = np.array(devices[: math.prod(shape)]).reshape(shape)
         return cls(
             mesh=Mesh(grid, (SEEDS, MEMBERS)),
             num_seeds=len(settings.lanes),
             n_models=settings.n_models,
-            n_policies=settings.n_policies,
+            n_policies=settings.policies_per_model,
             n_members=settings.n_members,
             sequential=on_cpu,
             copies=copies(shape[1]),

@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from vecpsmbpo import mixture
 from vecpsmbpo.loggers import Loggers
 from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings.parts import PosteriorSettings
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
 METRICS_FILE, EPISODES_FILE = "metrics.jsonl", "episodes.jsonl"
@@ -119,18 +121,18 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
                 **_lane(settings, seed),
                 "episode": int(index),
                 "env_steps": env_steps + int(step) + 1,
-                "model": None if member < 0 else int(member) // settings.n_policies,
-                "policy": None if member < 0 else int(member) % settings.n_policies,
+                "model": None if member < 0 else int(member) // settings.policies_per_model,
+                "policy": None if member < 0 else int(member) % settings.policies_per_model,
                 "return": float(episode_return),
                 "length": int(length),
                 "terminated": terminated,
                 "truncated": not terminated,
                 "random": bool(news.random[step, seed]),
-                "probs": news.probs[step, seed].reshape(-1, settings.n_policies).tolist(),
+                "probs": news.probs[step, seed].reshape(-1, settings.policies_per_model).tolist(),
             }
         )
         if news.values is not None:
-            lines[-1]["values"] = news.values[step, seed].reshape(-1, settings.n_policies).tolist()
+            lines[-1]["values"] = news.values[step, seed].reshape(-1, settings.policies_per_model).tolist()
     return lines
 
 
@@ -147,9 +149,7 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     updates = stats.pop("updates")
     env_steps = int(state.counters.env_steps)
     fitted = np.asarray(seeds.models.optimizer.count)[:, 0] > 0
-    ratios = jax.vmap(lambda hyper, bandit: mixture.real_ratios(settings, hyper, bandit, state.counters.env_steps))(
-        seeds.hyper, seeds.bandit
-    )
+    ratios = _real_ratios(state, settings)
     lines = []
     for seed in range(len(settings.lanes)):
         episodes = float(seeds.epoch_episodes[seed])
@@ -168,14 +168,22 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
                 "unsound_steps": int(seeds.epoch_unsound[seed]),
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
-                "real_ratio": _number(np.asarray(ratios[seed], np.float64).mean()),
-                "temperature": _number(seeds.hyper.temperature[seed]),
+                "real_ratio": None if ratios is None else _number(np.asarray(ratios[seed], np.float64).mean()),
+                "temperature": None if ratios is None else _number(seeds.hyper.temperature[seed]),
             }
         )
         if seeds.bandit is not None:
             bandit = jax.tree.map(lambda x, seed=seed: x[seed], seeds.bandit)
             lines[-1]["real_ratio_probs"] = mixture.probabilities(bandit).tolist()
     return lines
+
+
+def _real_ratios(state: TrainState, settings: Settings) -> jax.Array | None:
+    """[S, N·M] the λ of each member now, or None where no data are mixed."""
+    if not isinstance(settings, PosteriorSettings):
+        return None
+    of_seed = partial(mixture.real_ratios, settings, env_steps=state.counters.env_steps)
+    return jax.vmap(lambda hyper, bandit: of_seed(hyper, bandit))(state.seeds.hyper, state.seeds.bandit)
 
 
 def _lane(settings: Settings, index: int) -> Line:

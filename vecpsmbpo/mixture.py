@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings.parts import PosteriorSettings
 from vecpsmbpo.types import Bandit, Hyper
 
 
-def real_ratios(settings: Settings, hyper: Hyper, bandit: Bandit | None, env_steps: jax.Array) -> jax.Array:
+def real_ratios(settings: PosteriorSettings, hyper: Hyper, bandit: Bandit | None, env_steps: jax.Array) -> jax.Array:
     """[N·M] the λ with which each member learns now."""
     if bandit is not None:
         return jnp.asarray(settings.real_ratio_arms)[arms_of_members(settings, bandit)]
@@ -54,7 +54,7 @@ def linear(mean: jax.Array, progress: jax.Array) -> jax.Array:
 GRID = 512
 
 
-def arms_of_members(settings: Settings, bandit: Bandit) -> jax.Array:
+def arms_of_members(settings: PosteriorSettings, bandit: Bandit) -> jax.Array:
     """[N·M] the arm of each member: the arms' probabilities cut into N·M equal pieces, in the order of λ.
 
     So a member's λ moves from one arm to the next or stays; m decides before n, so that every model has members of high
@@ -67,7 +67,7 @@ def arms_of_members(settings: Settings, bandit: Bandit) -> jax.Array:
     return jnp.minimum(arm, bandit.counts.shape[0] - 1)
 
 
-def init(settings: Settings) -> Bandit:
+def init(settings: PosteriorSettings) -> Bandit:
     """Nothing is known: arms are equally likely."""
     nothing, most = jnp.zeros(len(settings.real_ratio_arms)), jnp.float32(1e30)
     return Bandit(excess=nothing, counts=nothing, rounds=jnp.int32(0), lowest=most, highest=-most)

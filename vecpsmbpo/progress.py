@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from vecpsmbpo.algorithms import Algorithm
+from vecpsmbpo.algorithms.base import Algorithm
 
 PLAIN_LINE_EVERY_S = 30.0  # where there is no terminal, besides the one at the end of each epoch
 

@@ -9,10 +9,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from vecpsmbpo import imagination, replay
+from vecpsmbpo import replay
+from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.layout import MEMBERS, SEEDS, Layout
-from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.types import EnvSpec, TrainState
+from vecpsmbpo.settings import SettingError
+from vecpsmbpo.types import TrainState
 
 GIB = 2**30
 CHECKPOINT_OVERHEAD = 2**20  # orbax's own files
@@ -32,17 +33,16 @@ def state_bytes(layout: Layout, shapes: Any) -> int:
     return total
 
 
-def working_bytes(settings: Settings, spec: EnvSpec, layout: Layout) -> int:
-    """Bytes of the largest temporaries: minibatches of a step, rows in flight of a rollout, on a CPU also the rings
-    of one device, which are put together before they are handed to it when a run is resumed."""
+def working_bytes(algorithm: Algorithm) -> int:
+    """Bytes of the largest temporaries: what the algorithm computes with, on a CPU also the rings of one device, which
+    are put together before they are handed to it when a run is resumed."""
+    spec, layout = algorithm.spec, algorithm.layout
     row = 4 * replay.row_size(spec.obs_size, spec.action_size)
     members = layout.padded_members * layout.num_seeds
-    minibatches = 3 * settings.updates_per_step * settings.policy_batch_size * row
-    rollout = imagination.chunk_size(settings) * (2 * row + 8 * settings.model_hidden_size)
-    working = members * max(minibatches, rollout)
+    working = members * algorithm.working_bytes(row)
     if not _on_cpu(layout):
         return working
-    rings = members * imagination.ring_capacity(settings) * row
+    rings = members * algorithm.ring_capacity * row
     return max(working, rings // layout.mesh.size)
 
 
@@ -78,7 +78,7 @@ def _control_group_available() -> int:
     return 2**63 if limit == "max" else int(limit) - used + int(stat.get("inactive_file", 0))
 
 
-def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any) -> str:
+def check_memory(algorithm: Algorithm, shapes: Any) -> str:
     """What the run takes against what there is, in words.
 
     Args:
@@ -87,7 +87,8 @@ def check_memory(settings: Settings, spec: EnvSpec, layout: Layout, shapes: Any)
     Raises:
         SettingError: it does not fit.
     """
-    state, working = state_bytes(layout, shapes), working_bytes(settings, spec, layout)
+    layout = algorithm.layout
+    state, working = state_bytes(layout, shapes), working_bytes(algorithm)
     working += state_bytes(layout, shapes.without_rings())  # as a stride began, should it have to be undone
     program = PROGRAM_BYTES if _on_cpu(layout) else 0
     free = available_bytes(layout)

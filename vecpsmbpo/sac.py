@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from vecpsmbpo import networks, optim
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings.parts import SacSettings
 from vecpsmbpo.types import Agent, AgentStats, EnvSpec, Hyper, Params, Transition
 
 
@@ -38,7 +38,7 @@ class Limits(NamedTuple):
     highest_reward: jax.Array
 
 
-def make_networks(settings: Settings, spec: EnvSpec) -> Networks:
+def make_networks(settings: SacSettings, spec: EnvSpec) -> Networks:
     size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
     most = networks.LOG_PROB_BOUND if settings.bound_log_prob else float("inf")
     return Networks(

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vecpsmbpo.settings import TRACED, Settings
+from vecpsmbpo.settings import Settings
 
 Params = Any  # a pytree of arrays
 TerminationRule = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
@@ -53,22 +53,23 @@ class Transition(NamedTuple):
 
 
 class Hyper(struct.PyTreeNode):
-    """What may be swept as a number: traced leaves, scalars here and [S] in a train state."""
+    """What may be swept as a number: traced leaves, scalars here and [S] in a train state. None, and no leaf, where the
+    algorithm has no such setting."""
 
     model_learning_rate: jax.Array
     model_weight_decay: jax.Array
-    policy_learning_rate: jax.Array
-    discount: jax.Array
-    target_entropy: jax.Array
-    target_update_rate: jax.Array
-    real_ratio: jax.Array
-    temperature: jax.Array
-    forced_exploration: jax.Array
     prior_scale: jax.Array
+    forced_exploration: jax.Array
+    policy_learning_rate: Any = None
+    discount: Any = None
+    target_entropy: Any = None
+    target_update_rate: Any = None
+    real_ratio: Any = None
+    temperature: Any = None
 
     @classmethod
     def of(cls, settings: Settings) -> "Hyper":
-        return cls(**{name: jnp.float32(getattr(settings, name)) for name in TRACED})
+        return cls(**{name: jnp.float32(getattr(settings, name)) for name in settings.traced})
 
 
 class Prior(struct.PyTreeNode):

@@ -1,15 +1,49 @@
-"""A folder per algorithm over the functions of `base.Algorithm`."""
+"""The algorithms by name: a folder each, with its own settings, over the functions of `base.Algorithm`.
 
-from vecpsmbpo.algorithms.base import Algorithm
-from vecpsmbpo.algorithms.pets.algorithm import Pets
-from vecpsmbpo.algorithms.ps_mbpo.algorithm import PsMbpo
-from vecpsmbpo.algorithms.slbo.algorithm import Slbo
-from vecpsmbpo.layout import Layout
+Knows their settings; what learns, and JAX with it, is imported when it is to be made.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from vecpsmbpo.algorithms.pets.settings import PetsSettings
+from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
+from vecpsmbpo.algorithms.slbo.settings import SlboSettings
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import EnvSpec
+
+if TYPE_CHECKING:
+    from vecpsmbpo.algorithms.base import Algorithm
+    from vecpsmbpo.types import EnvSpec
 
 
-def make(settings: Settings, spec: EnvSpec) -> Algorithm:
+class Entry(NamedTuple):
+    """An algorithm.
+
+    Attributes:
+        settings: the class of its settings.
+        place: `module:class` of what learns.
+    """
+
+    settings: type[Settings]
+    place: str
+
+
+_PS_MBPO = Entry(PsMbpoSettings, "vecpsmbpo.algorithms.ps_mbpo.algorithm:PsMbpo")
+
+TABLE = {
+    "ops_mbpo": _PS_MBPO,
+    "ps_mbpo": _PS_MBPO,
+    "mbpo": _PS_MBPO,
+    "sac": _PS_MBPO,
+    "pets": Entry(PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets"),
+    "slbo": Entry(SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo"),
+}
+
+
+def make(settings: Settings, spec: "EnvSpec") -> "Algorithm":
     """The algorithm that `algo=` names, on this process's devices."""
-    chosen = Pets if settings.plans else Slbo if settings.alternates else PsMbpo
+    from vecpsmbpo.layout import Layout
+
+    module, _, name = TABLE[settings.algo].place.partition(":")
+    chosen: Any = getattr(import_module(module), name)
     return chosen(settings, spec, Layout.of(settings))

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import dynamics, health, imagination, mixture, posterior, replay
+from vecpsmbpo import dynamics, health, posterior, replay
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import Counters, EnvSpec, Episode, EpisodeEnd, Hyper, Moments, SeedState, Transition
+from vecpsmbpo.types import Counters, EnvSpec, Episode, EpisodeEnd, Hyper, Moments, Posterior, SeedState, Transition
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,10 @@ class Algorithm(ABC):
         """How many gradient steps and imagined rows there are in the steps `learning`, which learn and of which
         `refreshes` begin with a refresh; of all members together. For the display of speeds."""
 
+    def working_bytes(self, row: int) -> int:
+        """Of the largest temporaries of one member; a transition takes `row` of them."""
+        return 0
+
     def memory(self) -> Any:
         """What is remembered when an episode begins."""
         return ()
@@ -63,6 +67,24 @@ class Algorithm(ABC):
     def values(self, state: SeedState) -> jax.Array | None:
         """[N·M] what each member promises, where `weights=values`, or None."""
         return None
+
+    def draw(self, members: Posterior, values: Any, hyper: Hyper, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Who acts in the episode that begins, [] int, and the distribution [N·M] that it was drawn from."""
+        return jnp.int32(0), jnp.ones(self.settings.n_members)
+
+    def credit(self, state: SeedState, episode_return: jax.Array, counts: jax.Array) -> SeedState:
+        """What the episode that ends earned, [], where `counts`: added to what is known of the member that acted."""
+        credited = posterior.credit(state.posterior, state.episode.member, episode_return, counts)
+        return state.replace(posterior=credited)
+
+    def refreshes(self, counters: Counters, state: SeedState) -> jax.Array:
+        """Whether there is anything to refresh for in the period that begins, [] bool."""
+        return jnp.bool_(True)
+
+    @property
+    def ring_capacity(self) -> int:
+        """C_M: rows that are imagined for a member and kept."""
+        return 1
 
     def imagined_rows(self, counters: Counters, enabled: jax.Array) -> jax.Array:
         """The counter of `counters` after `refresh`."""
@@ -79,9 +101,8 @@ class Algorithm(ABC):
         settings, spec, layout = self.settings, self.spec, self.layout
         key, model_key, agent_key, draw_key = jax.random.split(key, 4)
         members = posterior.init(settings.n_members)
-        values = jnp.zeros(settings.n_members) if settings.weighs_values else None  # no episode has begun yet
         size = spec.obs_size + spec.action_size
-        ring = replay.init(imagination.ring_capacity(settings), spec.obs_size, spec.action_size)
+        ring = replay.init(self.ring_capacity, spec.obs_size, spec.action_size)
         return SeedState(
             key=key,
             hyper=hyper,
@@ -94,10 +115,10 @@ class Algorithm(ABC):
             imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
             moments=_no_moments(size, spec.obs_size),
             posterior=members,
-            episode=self._begin_episode(members, values, hyper, jnp.int32(1), jnp.int32(1), jnp.bool_(True), draw_key),
-            starts=jnp.zeros((posterior.STARTS, spec.obs_size)) if settings.weighs_values else None,
+            episode=self._begin_episode(members, None, hyper, jnp.int32(1), jnp.int32(1), jnp.bool_(True), draw_key),
+            starts=None,
             memory=self.memory(),
-            bandit=mixture.init(settings) if settings.adapts_real_ratio else None,
+            bandit=None,
             epoch_return=jnp.zeros(()),
             epoch_episodes=jnp.zeros(()),
             epoch_unsound=jnp.zeros(()),
@@ -131,7 +152,7 @@ class Algorithm(ABC):
 
         Where something in it is not finite, the episode ends before it, truncated, with the return so far.
         """
-        episode, bandit = state.episode, state.bandit
+        episode = state.episode
         row, sound = self._row(state, transition)
         total = episode.episode_return + jnp.where(sound, transition.reward, 0.0)
         length = episode.length + 1
@@ -148,29 +169,22 @@ class Algorithm(ABC):
             probs=episode.probs,
             values=episode.values,
         )
-        counts = done & ~episode.random
-        members = posterior.credit(state.posterior, episode.member, total, counts)
-        if bandit is not None:
-            arm = mixture.arms_of_members(self.settings, bandit)[episode.member]
-            credited = mixture.credit(bandit, arm, total)
-            bandit = jax.tree.map(partial(jnp.where, counts), credited, bandit)
+        state = self.credit(state, total, done & ~episode.random)
         random = counters.env_steps + 1 < self.settings.warmup_steps
         index, warmups = episode.index + 1, episode.warmups + random
         stored = self._unpack(row)
         start = jnp.where(jnp.isfinite(transition.obs), transition.obs, stored.obs)
         starts = posterior.add_start(state.starts, episode, start)
         values = self.values(state.replace(starts=starts))
-        following = self._begin_episode(members, values, state.hyper, index, warmups, random, key)
+        following = self._begin_episode(state.posterior, values, state.hyper, index, warmups, random, key)
         running = episode.replace(episode_return=total, length=length)
         state = state.replace(
             real=replay.add(state.real, row[None], counters.env_steps),
             newest=row,
             moments=_welford(state.moments, stored, counters.env_steps),
-            posterior=members,
             episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
             starts=starts,
             memory=jax.tree.map(partial(jnp.where, done), self.memory(), state.memory),
-            bandit=bandit,
             epoch_return=state.epoch_return + jnp.where(done, total, 0.0),
             epoch_episodes=state.epoch_episodes + done,
             epoch_unsound=state.epoch_unsound + ~sound,
@@ -192,9 +206,7 @@ class Algorithm(ABC):
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
 
     def _begin_episode(self, members, values, hyper: Hyper, index, warmups, random, key: jax.Array) -> Episode:
-        member, probs = posterior.draw(posterior.logits(members, values, hyper.temperature), key)
-        if self.settings.posterior == "average":
-            member = jnp.int32(-1)
+        member, probs = self.draw(members, values, hyper, key)
         after_warmup = jnp.maximum(index - warmups, 1)
         explores = posterior.exploration_probability(hyper.forced_exploration, after_warmup)
         random |= jax.random.bernoulli(jax.random.fold_in(key, 1), explores)
@@ -202,18 +214,6 @@ class Algorithm(ABC):
         return Episode(index, warmups, member, random, probs, values, episode_return=zero, length=jnp.int32(0))
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
-
-    def real_ratios(self, counters: Counters, state: SeedState) -> jax.Array:
-        """[N·M] the λ of each member now."""
-        return mixture.real_ratios(self.settings, state.hyper, state.bandit, counters.env_steps)
-
-    def imagines(self, counters: Counters, state: SeedState) -> jax.Array:
-        """Whether any member may learn from imagined data, [] bool, in the period that begins: λ may fall from 1 within
-        it, and what is then drawn from must be there."""
-        if self.settings.adapts_real_ratio:
-            return jnp.bool_(self.settings.imagines)  # any member may move to any λ
-        last = counters._replace(env_steps=counters.env_steps + self.settings.model_update_every)
-        return jnp.any(self.real_ratios(last, state) < 1)
 
     def begin_epoch(self, counters: Counters, state: SeedState) -> SeedState:
         """Clears the epoch's sums when an epoch begins."""

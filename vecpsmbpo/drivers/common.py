@@ -103,9 +103,6 @@ def over_seeds(function: Callable) -> Callable:
 def begin_stride(algorithm: Algorithm, state: TrainState) -> tuple[TrainState, jax.Array]:
     """Refreshes models and imagined data where a period begins, and says whether this period learns: not before the
     warm-up is over.
-
-    Where every seed learns from real data alone (λ = 1, equation 15), models are not needed and not
-    fitted.
     """
     counters, seeds = state.counters, state.seeds
     into_period = counters.env_steps % algorithm.settings.model_update_every
@@ -113,7 +110,7 @@ def begin_stride(algorithm: Algorithm, state: TrainState) -> tuple[TrainState, j
     advanced, keys = split_keys(seeds, 1)
     seeds = seeds.replace(key=jnp.where(into_period == 0, advanced.key, seeds.key))
     seeds = over_seeds(algorithm.begin_epoch)(counters, seeds)
-    needed = algorithm.layout.any_seed(over_seeds(algorithm.imagines)(counters, seeds))
+    needed = algorithm.layout.any_seed(over_seeds(algorithm.refreshes)(counters, seeds))
     imagining = (into_period == 0) & learning & needed
     seeds = over_seeds(lambda c, s, k: algorithm.refresh(c, s, imagining, k))(counters, seeds, keys[:, 0])
     counters = counters._replace(imagined_rows=algorithm.imagined_rows(counters, imagining))

@@ -182,13 +182,12 @@ class _Probe:
         }
 
     def _critics(self, trained: "Trained", seen: Any, random: np.random.Generator) -> dict[str, Any] | None:
-        from vecpsmbpo import sac
         from vecpsmbpo.look import diagnostics, members
 
         if not trained.has_members:
             return None
         critics, alpha = trained.critics()
-        nets = sac.make_networks(trained.run.settings, trained.algorithm.spec)
+        nets = trained.nets
         shape = (len(alpha), -1)
         obs, action = (x.reshape(*shape, x.shape[-1]) for x in (seen.obs, seen.action))
         q = np.asarray(diagnostics.values(critics, obs, action, nets=nets)).reshape(seen.reward.shape)
@@ -225,9 +224,7 @@ def _members_act(trained: "Trained", each: int) -> Any:
     """Every member in `each` episodes of its own, acting as in training."""
     import jax
 
-    from vecpsmbpo import sac
-
-    actor, actors = sac.make_networks(trained.run.settings, trained.algorithm.spec).actor, trained.actors()
+    actor, actors = trained.nets.actor, trained.actors()
     count = trained.run.settings.n_members
 
     @jax.jit

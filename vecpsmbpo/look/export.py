@@ -20,6 +20,7 @@ import numpy as np
 
 from vecpsmbpo.look import arguments, dataset, files, runs
 from vecpsmbpo.settings import SettingError
+from vecpsmbpo.settings.parts import SacSettings
 
 if TYPE_CHECKING:
     from vecpsmbpo.look.members import Trained
@@ -75,7 +76,7 @@ def run(words: Sequence[str]) -> int:
         _check_extra(name)
     found = runs.load(path)
     runs.check_lane(found, options["lane"])
-    if found.settings.plans or found.settings.alternates:
+    if not isinstance(found.settings, SacSettings):
         raise SettingError(
             f"run_dir={path}: only policies that learn by SAC can be exported, not algo={found.settings.algo}"
         )

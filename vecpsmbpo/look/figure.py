@@ -17,6 +17,7 @@ from vecpsmbpo.look.experiments import Experiment
 from vecpsmbpo.look.groups import Group
 from vecpsmbpo.look.runs import Lane
 from vecpsmbpo.settings import SettingError
+from vecpsmbpo.settings.parts import PosteriorSettings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -168,7 +169,7 @@ def draw_averages(experiment: Experiment) -> "Figure":
     from vecpsmbpo.look import style
 
     figure, panels, _ = _panels(experiment, ["n_policies", "posterior"])
-    sizes = sorted({run.settings.n_policies for run in experiment.runs})
+    sizes = sorted({run.settings.policies_per_model for run in experiment.runs})
     looks = dict(zip(sizes, style.looks(len(sizes)), strict=True))
     for axis, _, here in panels:
         for one, line in zip(here, _curves(here), strict=True):
@@ -190,7 +191,7 @@ def draw_bars(experiment: Experiment) -> "Figure":
     from vecpsmbpo.look import style
 
     figure, panels, _ = _panels(experiment, ["n_policies", "n_models"])
-    sizes = sorted({run.settings.n_policies for run in experiment.runs})
+    sizes = sorted({run.settings.policies_per_model for run in experiment.runs})
     width = 0.8 / len(sizes)
     for axis, task, here in panels:
         for index, (m, look) in enumerate(zip(sizes, style.looks(len(sizes), ordered=True), strict=True)):
@@ -229,6 +230,7 @@ def draw_weights(experiment: Experiment) -> "Figure":
     returns.set_ylabel("return")
     returns.legend()
     settings = lane.run.settings
+    assert isinstance(settings, PosteriorSettings)
     where = f"experiment={experiment.name} size={experiment.size}"
     title = f"{settings.task}: {where}, {lane.name}, τ = {settings.temperature:g}"
     figure.suptitle(title, x=0.01, ha="left", fontsize=9)

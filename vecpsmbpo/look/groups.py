@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vecpsmbpo.algorithms.catalogue import FIELDS
 from vecpsmbpo.config import closest
 from vecpsmbpo.look.runs import Lane, Run
-from vecpsmbpo.settings import CHANGEABLE, FIELDS, SettingError
+from vecpsmbpo.settings import CHANGEABLE, SettingError
 
 # Of two runs that differ in these alone, one may stand for the other, or prolong it.
 _UNTOLD = ({"seed", "num_seeds", "run_dir"} | CHANGEABLE) - {"eval_policy", "eval_actions"}
@@ -116,9 +117,9 @@ def group(runs: Sequence[Run], by: Sequence[str] = ()) -> list[Group]:
 def _facts(lane: Lane) -> dict[str, Any]:
     """Every setting of a lane, with what its run swept, its task's options, and the run's directory."""
     settings = lane.run.settings
-    plain = {name: getattr(settings, name) for name in FIELDS}
-    if settings.real_ratio_schedule != "constant":
-        plain["real_ratio"] = "chosen online" if settings.adapts_real_ratio else "falling from 1"
+    plain = {name: getattr(settings, name, None) for name in FIELDS}
+    if plain["real_ratio_schedule"] not in (None, "constant"):
+        plain["real_ratio"] = {"bandit": "chosen online", "linear": "falling from 1"}[plain["real_ratio_schedule"]]
     options = {f"env.{name}": value for name, value in settings.env_options}
     return {**plain, **options, **lane.values, RUN: _shortest(lane.run.path)}
 

@@ -9,12 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vecpsmbpo import imagination, posterior, replay, sac
-from vecpsmbpo.algorithms import Algorithm
+from vecpsmbpo.algorithms.base import Algorithm
+from vecpsmbpo.algorithms.pets.settings import PetsSettings
+from vecpsmbpo.algorithms.ps_mbpo.algorithm import PsMbpo
 from vecpsmbpo.checkpoint import Saved
 from vecpsmbpo.drivers.common import evaluation_policies
 from vecpsmbpo.evaluate import restore, restore_each
 from vecpsmbpo.look.runs import Run, check_lane
 from vecpsmbpo.settings import SettingError
+from vecpsmbpo.settings.parts import ImaginationSettings, PosteriorSettings, SacSettings
 from vecpsmbpo.types import Model, SeedState
 
 Array = np.ndarray
@@ -46,8 +49,13 @@ class Trained:
     @property
     def has_members(self) -> bool:
         """Whether policies learn by SAC, so that each can be asked by itself."""
-        settings = self.run.settings
-        return not (settings.plans or settings.alternates)
+        return isinstance(self.run.settings, SacSettings)
+
+    @property
+    def nets(self) -> sac.Networks:
+        """Of its policies, where it `has_members`."""
+        assert isinstance(self.algorithm, PsMbpo)
+        return self.algorithm.nets
 
     def actors(self) -> Any:
         """Parameters of every member's policy, leaves [N·M, ...]."""
@@ -74,6 +82,7 @@ class Trained:
         if not self.imagined_rows:
             return None
         rings, settings = self.state.imagined[self.index][self._members], self.run.settings
+        assert isinstance(settings, ImaginationSettings), "others leave their rings empty"
         newest = min(self.imagined_rows, int(imagination.retained_rows(settings, jnp.int32(self.step))))
         rows = (self.imagined_rows - 1 - random.integers(0, newest, most)) % rings.shape[1]
         return self._observations(rings, (random.integers(0, len(rings), most), rows))
@@ -136,7 +145,7 @@ def acting(trained: Trained, member: str) -> list[tuple[str, Act]]:
         SettingError: the algorithm plans, has no members, or not this one.
     """
     settings = trained.run.settings
-    if settings.plans:
+    if isinstance(settings, PetsSettings):
         raise SettingError(f"run_dir={trained.run.path}: algo={settings.algo} plans its actions; there is no policy")
     if member in ("best", "posterior"):
         return [(member, _evaluated(trained, member))]
@@ -145,7 +154,7 @@ def acting(trained: Trained, member: str) -> list[tuple[str, Act]]:
     names = member_names(trained.run)
     if member != "all" and member not in names:
         raise SettingError(f"member={member}: must be best, posterior, all or one of {'  '.join(names)}")
-    actor, actors = sac.make_networks(settings, trained.algorithm.spec).actor, trained.actors()
+    actor, actors = trained.nets.actor, trained.actors()
 
     def policy(index: int) -> Act:
         params = jax.tree.map(lambda x: x[index], actors)
@@ -156,8 +165,8 @@ def acting(trained: Trained, member: str) -> list[tuple[str, Act]]:
 
 def member_names(run: Run) -> list[str]:
     """`n,m` of every member, as `member=` takes them; `0,m` where policies belong to no model."""
-    m, own = run.settings.n_policies, run.settings.rollout_models == "own"
-    return [f"{index // m},{index % m}" if own else f"0,{index}" for index in range(run.settings.n_members)]
+    m = run.settings.policies_per_model
+    return [f"{index // m},{index % m}" for index in range(run.settings.n_members)]
 
 
 def _evaluated(trained: Trained, who: str) -> Act:
@@ -165,8 +174,8 @@ def _evaluated(trained: Trained, who: str) -> Act:
     anything, the mean of all members' actions."""
     settings = trained.run.settings
     settings = replace(settings, eval_policy=who, eval_actions="mean")
-    if settings.posterior == "average":
-        actor, actors = sac.make_networks(settings, trained.algorithm.spec).actor, trained.actors()
+    if isinstance(settings, PosteriorSettings) and settings.posterior == "average":
+        actor, actors = trained.nets.actor, trained.actors()
         return jax.jit(lambda obs: jax.vmap(lambda params: actor.law(params, obs).mode())(actors).mean(axis=0))
     algorithm = replace(trained.algorithm, settings=settings)
     chosen = trained.of_lane(evaluation_policies(algorithm)(trained.state, trained.state.key))

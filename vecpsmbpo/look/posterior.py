@@ -52,7 +52,7 @@ def draw(lane: Lane) -> Figure:
     figure = Figure(figsize=(4.4, 4.6), layout="constrained")
     weights, returns = figure.subplots(2, 1, sharex=True, height_ratios=(1.35, 1))
     draw_weights(weights, lane)
-    _draw_returns(returns, lane.episodes, acting(lane.episodes, lane.run.settings.n_policies))
+    _draw_returns(returns, lane.episodes, acting(lane.episodes, lane.run.settings.policies_per_model))
     return figure
 
 
@@ -66,7 +66,7 @@ def draw_weights(axes: Axes, lane: Lane, x: str = "episode", until: float = np.i
     settings = lane.run.settings
     there = lane.episodes[x] <= until
     episodes = {name: column[there] for name, column in lane.episodes.items()}
-    acts, between = acting(episodes, settings.n_policies), edges(len(episodes[x]))
+    acts, between = acting(episodes, settings.policies_per_model), edges(len(episodes[x]))
     before = np.concatenate([[0.0], episodes[x]])  # an episode reaches from the end of the one before it to its own
     ends, probs = before[between], binned(episodes["probs"], between)
     rows = np.arange(probs.shape[1] + 1) - 0.5
@@ -81,7 +81,7 @@ def draw_weights(axes: Axes, lane: Lane, x: str = "episode", until: float = np.i
     axes.set_title(title, fontweight="normal", fontsize=9)
     axes.grid(False)
     axes.invert_yaxis()
-    labels = names(settings.n_models, settings.n_policies, probs.shape[1])
+    labels = names(settings.n_models, settings.policies_per_model, probs.shape[1])
     shown = range(0, len(labels), -(-len(labels) // 12))
     axes.set_yticks(list(shown), [labels[index] for index in shown])
     axes.set_ylabel("member n, m" if "," in labels[0] else "member m")

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vecpsmbpo import config
+from vecpsmbpo.algorithms.catalogue import of_algorithm
 from vecpsmbpo.look import arguments, compare, diagnose, files, groups, runs, statistics
 from vecpsmbpo.look.curves import AXES, curve
 from vecpsmbpo.look.runs import METRICS_FILE, Lane, Run
-from vecpsmbpo.settings import FIELDS, SettingError, Settings
+from vecpsmbpo.settings import SettingError, Settings
+from vecpsmbpo.settings.parts import PosteriorSettings
 
 if TYPE_CHECKING:
     from vecpsmbpo.look.page import Page
@@ -200,7 +202,7 @@ def _state(run: Run) -> str:
     state = "complete" if run.complete else "not complete"
     written = time.strftime("%Y-%m-%d %H:%M", time.localtime((run.path / METRICS_FILE).stat().st_mtime))
     parts = [
-        f"N = {settings.n_models}, M = {settings.n_policies}",
+        f"N = {settings.n_models}, M = {settings.policies_per_model}",
         _plural(settings.num_seeds, "seed"),
         *(f"{len(values)} values of {groups.SYMBOLS.get(name, name)}" for name, values in settings.sweep),
         f"size {settings.size}",
@@ -279,7 +281,7 @@ def _chances_picture(page: "Page", run: Run) -> str:
     from vecpsmbpo.look import style
 
     columns = [lane.epochs["real_ratio_probs"] for lane in run.lanes if "real_ratio_probs" in lane.epochs]
-    if not columns:
+    if not columns or not isinstance(run.settings, PosteriorSettings):
         return ""
     shortest = min(map(len, columns))
     chances = np.mean([column[:shortest] for column in columns], axis=0)
@@ -307,7 +309,7 @@ def _add_posterior(page: "Page", run: Run) -> None:
     )
 
     def picture(lane: Lane) -> str:
-        acts = posterior.acting(lane.episodes, run.settings.n_policies)
+        acts = posterior.acting(lane.episodes, run.settings.policies_per_model)
         caption = f"{lane.name}: {_plural(len(acts), 'episode')}, {np.sum(acts < 0)} of them by no single member"
         return page.picture(posterior.draw(lane), caption)
 
@@ -323,7 +325,7 @@ def _add_settings(page: "Page", run: Run) -> None:
 
     settings = run.settings
     page.add("<h3>Again</h3>", f"<pre>{escape(command(settings))}</pre>")
-    plain = [(name, groups.display(name, getattr(settings, name))) for name in FIELDS]
+    plain = [(name, groups.display(name, getattr(settings, name))) for name in of_algorithm(settings.algo)]
     options = [(f"env.{name}", value) for name, value in settings.env_options]
     swept = [(f"sweep.{name}", groups.display(name, values)) for name, values in settings.sweep]
     page.add(html.details("every setting", html.table(("setting", "value"), [*plain, *options, *swept])))
@@ -344,7 +346,7 @@ def command(settings: Settings) -> str:
     words = [f"env={settings.env}", *(f"env.{name}={value}" for name, value in settings.env_options)]
     words += [f"algo={settings.algo}", f"size={settings.size}"]
     usual = config.compose(words)
-    for name in FIELDS:
+    for name in of_algorithm(settings.algo):
         value = getattr(settings, name)
         if name != "run_dir" and value != getattr(usual, name):
             words.append(f"{name}={_word(value)}")

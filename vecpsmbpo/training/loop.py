@@ -35,7 +35,7 @@ def train(settings: Settings) -> int:
     runtime.configure(settings)
     driver = make_driver(settings)
     shapes = driver.shapes(*initial_inputs(settings))
-    memory = resources.check_memory(settings, driver.algorithm.spec, driver.layout, shapes)
+    memory = resources.check_memory(driver.algorithm, shapes)
     run_dir = Path(settings.run_dir)
     with disk_errors(run_dir):
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -103,9 +103,7 @@ class _Session:
         swept = "".join(f"{len(values)} values of {name} × " for name, values in settings.sweep)
         self.display.say(
             f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × {swept}"
-            f"N = {settings.n_models} models × M = {settings.n_policies} policies"
-            f"{' in all of them' if settings.rollout_models == 'any' else ''}, "
-            f"{settings.updates_per_step} updates per step, on {layout.mesh.size} {jax.default_backend()} device(s)"
+            f"{settings.scale}, on {layout.mesh.size} {jax.default_backend()} device(s)"
         )
         self.display.say(f"memory: {self.memory}")
         where = f"resuming at step {self.env_steps}" if self.env_steps else "starting"

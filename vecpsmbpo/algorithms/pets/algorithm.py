@@ -8,11 +8,14 @@ import numpy as np
 
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.pets import planning
+from vecpsmbpo.algorithms.pets.settings import PetsSettings
 from vecpsmbpo.types import AgentStats, Counters, Model, Planner, SeedState
 
 
 class Pets(Algorithm):
     """Model-predictive control; an episode remembers its plan, from which the next one starts."""
+
+    settings: PetsSettings
 
     def init_agent(self, key: jax.Array) -> Planner:
         return Planner(stats=AgentStats.zero())

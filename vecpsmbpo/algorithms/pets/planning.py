@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from vecpsmbpo import dynamics
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.algorithms.pets.settings import PetsSettings
 from vecpsmbpo.types import EnvSpec, Model
 
 INITIAL_VARIANCE = 0.25  # of actions in [-1, 1]: (range / 4)²
@@ -15,7 +15,7 @@ SMOOTHING = 0.1  # of what the distribution was before an iteration, kept
 
 
 def cross_entropy(
-    value: Callable[[jax.Array, jax.Array], jax.Array], mean: jax.Array, key: jax.Array, settings: Settings
+    value: Callable[[jax.Array, jax.Array], jax.Array], mean: jax.Array, key: jax.Array, settings: PetsSettings
 ) -> jax.Array:
     """The plan [H, A] around which the cross-entropy method ends up.
 
@@ -46,7 +46,7 @@ def cross_entropy(
 
 
 def expected_returns(
-    models: Model, obs: jax.Array, plans: jax.Array, key: jax.Array, *, settings: Settings, spec: EnvSpec
+    models: Model, obs: jax.Array, plans: jax.Array, key: jax.Array, *, settings: PetsSettings, spec: EnvSpec
 ) -> jax.Array:
     """What each plan earns in the models, the mean over its particles: [K].
 

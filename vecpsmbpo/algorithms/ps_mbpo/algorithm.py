@@ -4,24 +4,64 @@ MBPO and SAC are settings of it: one policy that learns in all models (`rollout_
 real data alone (λ = 1, equation 15). They share every line, so that comparisons differ in the posterior only.
 """
 
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import health, imagination, posterior, replay, sac
+from vecpsmbpo import health, imagination, mixture, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
-from vecpsmbpo.networks import Actor
-from vecpsmbpo.types import Agent, Counters, Params, SeedState, Transition
+from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
+from vecpsmbpo.types import Agent, Counters, Hyper, Params, Posterior, SeedState, Transition
 
 
 class PsMbpo(Algorithm):
     """Policies that learn by SAC from real and imagined data."""
 
+    settings: PsMbpoSettings
+
+    @cached_property
+    def nets(self) -> sac.Networks:
+        return sac.make_networks(self.settings, self.spec)
+
     def init_agent(self, key: jax.Array) -> Agent:
-        return sac.init(key, sac.make_networks(self.settings, self.spec), self.spec)
+        return sac.init(key, self.nets, self.spec)
+
+    @property
+    def ring_capacity(self) -> int:
+        return imagination.ring_capacity(self.settings)
+
+    def working_bytes(self, row: int) -> int:
+        """Minibatches of a step, or rows in flight of a rollout."""
+        settings = self.settings
+        minibatches = 3 * settings.updates_per_step * settings.policy_batch_size * row
+        return max(minibatches, imagination.chunk_size(settings) * (2 * row + 8 * settings.model_hidden_size))
+
+    def init(self, key: jax.Array, hyper: Hyper) -> SeedState:
+        state, settings = super().init(key, hyper), self.settings
+        if settings.weighs_values:
+            unknown = jnp.zeros(settings.n_members)  # no episode has begun yet
+            starts = jnp.zeros((posterior.STARTS, self.spec.obs_size))
+            state = state.replace(starts=starts, episode=state.episode.replace(values=unknown))
+        return state.replace(bandit=mixture.init(settings) if settings.adapts_real_ratio else None)
+
+    # ── who acts: once an episode ────────────────────────────────────────────────────────────────────────────
+
+    def draw(self, members: Posterior, values: Any, hyper: Hyper, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """A member by equation 18 or 19; with `posterior=average` none, -1."""
+        member, probs = posterior.draw(posterior.logits(members, values, hyper.temperature), key)
+        return jnp.int32(-1) if self.settings.posterior == "average" else member, probs
+
+    def credit(self, state: SeedState, episode_return: jax.Array, counts: jax.Array) -> SeedState:
+        """To the member (equation 19) and, where λ is chosen online, to the λ that it learned with."""
+        bandit = state.bandit
+        if bandit is not None:
+            arm = mixture.arms_of_members(self.settings, bandit)[state.episode.member]
+            credited = mixture.credit(bandit, arm, episode_return)
+            state = state.replace(bandit=jax.tree.map(partial(jnp.where, counts), credited, bandit))
+        return super().credit(state, episode_return, counts)
 
     # ── act ──────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -51,11 +91,11 @@ class PsMbpo(Algorithm):
         step, as `choose` does; with `eval_policy=average` the average of all members' mean actions."""
         sampled = self.settings.eval_actions == "sampled"
         if not self._evaluates_all:
-            law = self._actor.law(policy, obs)
+            law = self.nets.actor.law(policy, obs)
             return (law.sample(key)[0] if sampled else law.mode()), ()
         if sampled or self.settings.eval_policy == "posterior":
             return self._of_mixture(policy, obs, key, sampled=sampled), ()
-        modes = jax.vmap(lambda params: self._actor.law(params, obs).mode())(policy)
+        modes = jax.vmap(lambda params: self.nets.actor.law(params, obs).mode())(policy)
         return self.layout.mean_over_members(modes), ()
 
     def values(self, state: SeedState) -> jax.Array | None:
@@ -69,7 +109,7 @@ class PsMbpo(Algorithm):
         starts, moments = state.starts, state.moments
         if starts is None:
             return None
-        nets = sac.make_networks(self.settings, self.spec)
+        nets = self.nets
         known = jnp.arange(posterior.STARTS) < state.episode.index
 
         def value(agent: Agent) -> jax.Array:
@@ -87,7 +127,7 @@ class PsMbpo(Algorithm):
         """[A] an action of one member: a sample, or its mean."""
 
         def action(params: Params) -> jax.Array:
-            law = self._actor.law(params, obs)
+            law = self.nets.actor.law(params, obs)
             return law.sample(key)[0] if sampled else law.mode()
 
         return self.layout.ask(member, actors, action)
@@ -101,15 +141,24 @@ class PsMbpo(Algorithm):
         return self._of_member(member, actors, obs, key, sampled=sampled)
 
     @property
-    def _actor(self) -> Actor:
-        return sac.make_networks(self.settings, self.spec).actor
-
-    @property
     def _evaluates_all(self) -> bool:
         # Nobody earns anything where all act together: there is no best member either, and all are it.
         return "average" in (self.settings.eval_policy, self.settings.posterior)
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
+
+    def real_ratios(self, counters: Counters, state: SeedState) -> jax.Array:
+        """[N·M] the λ of each member now."""
+        return mixture.real_ratios(self.settings, state.hyper, state.bandit, counters.env_steps)
+
+    def refreshes(self, counters: Counters, state: SeedState) -> jax.Array:
+        """Whether any member may learn from imagined data, [] bool, in the period that begins: λ may fall from 1 within
+        it, and what is then drawn from must be there. Who learns from real data alone (λ = 1, equation 15) needs no
+        models."""
+        if self.settings.adapts_real_ratio:
+            return jnp.bool_(self.settings.imagines)  # any member may move to any λ
+        last = counters._replace(env_steps=counters.env_steps + self.settings.model_update_every)
+        return jnp.any(self.real_ratios(last, state) < 1)
 
     def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Refits the models and renews the imagined data (Algorithm 1, lines 2, 9 and 10)."""
@@ -167,13 +216,13 @@ class PsMbpo(Algorithm):
     def imagined_rows(self, counters: Counters, enabled: jax.Array) -> jax.Array:
         """The counter of `counters` after `imagine`."""
         new = jnp.where(enabled, imagination.rows_per_refresh(self.settings, counters.env_steps), 0)
-        return replay.count(counters.imagined_rows, new, imagination.ring_capacity(self.settings))
+        return replay.count(counters.imagined_rows, new, self.ring_capacity)
 
     # ── learn: every step ────────────────────────────────────────────────────────────────────────────────────
 
     def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Agent:
         """The agents after G SAC updates of every member on λ D_E + (1 - λ) D_M^{n,m} (lines 11 and 12)."""
-        settings, layout, nets = self.settings, self.layout, sac.make_networks(self.settings, self.spec)
+        settings, layout, nets = self.settings, self.layout, self.nets
         batch_key, update_key = jax.random.split(key)
         ids = layout.member_ids()
         ratios = self.real_ratios(counters, state)[ids % settings.n_members]  # of padding members, too

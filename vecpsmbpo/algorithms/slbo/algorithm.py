@@ -1,6 +1,6 @@
 """SLBO for one seed: model and policy learn in turns at every refresh."""
 
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -10,19 +10,26 @@ import numpy as np
 from vecpsmbpo import dynamics, imagination
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.slbo import multistep, trpo
+from vecpsmbpo.algorithms.slbo.settings import SlboSettings
 from vecpsmbpo.types import Counters, Model, Params, Scaling, SeedState
 
 
 class Slbo(Algorithm):
     """The policy learns by TRPO from rollouts in the model, which goes on learning meanwhile."""
 
+    settings: SlboSettings
+
+    @cached_property
+    def nets(self) -> trpo.Networks:
+        return trpo.make_networks(self.settings, self.spec)
+
     def init_agent(self, key: jax.Array) -> trpo.TrpoAgent:
-        return trpo.init(key, self._nets, self.spec)
+        return trpo.init(key, self.nets, self.spec)
 
     def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
         """A sample of the policy, clipped."""
         obs = _whitened(self._scaling(state), obs)
-        sample = lambda params: self._nets.policy.law(params, obs).sample(key)  # noqa: E731
+        sample = lambda params: self.nets.policy.law(params, obs).sample(key)  # noqa: E731
         return jnp.clip(self.layout.ask(state.episode.member, state.agents.policy, sample), -1.0, 1.0), ()
 
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> tuple[Params, Scaling]:
@@ -32,7 +39,7 @@ class Slbo(Algorithm):
         self, policy: tuple[Params, Scaling], step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, Any]:
         params, scaling = policy
-        law = self._nets.policy.law(params, _whitened(scaling, obs))
+        law = self.nets.policy.law(params, _whitened(scaling, obs))
         action = law.loc if self.settings.eval_actions == "mean" else law.sample(key)
         return jnp.clip(action, -1.0, 1.0), ()
 
@@ -56,7 +63,7 @@ class Slbo(Algorithm):
                 def policy_step(agent, key):
                     rollout_key, update_key = jax.random.split(key)
                     rollouts = self.rollouts(counters, real, model, agent.policy, rollout_key)
-                    step = partial(trpo.update, settings=self.settings, nets=self._nets)
+                    step = partial(trpo.update, settings=self.settings, nets=self.nets)
                     return step(agent, rollouts, hyper.discount, update_key), None
 
                 agent, _ = jax.lax.scan(policy_step, agent, jax.random.split(policy_key, self.settings.policy_steps))
@@ -93,7 +100,7 @@ class Slbo(Algorithm):
         def step(obs, xs):
             t, key = xs
             action_key, model_key, fresh_key = jax.random.split(key, 3)
-            action = self._nets.policy.law(policy, seen(obs)).sample(action_key)
+            action = self.nets.policy.law(policy, seen(obs)).sample(action_key)
             answer = dynamics.predict_mean(model, obs, jnp.clip(action, -1.0, 1.0), model_key, net=net, spec=spec)
             ended = answer.terminated | (t == length - 1)
             terminated = answer.terminated.astype(jnp.float32)
@@ -108,10 +115,6 @@ class Slbo(Algorithm):
         settings = self.settings
         updates = len(refreshes) * settings.rounds * settings.policy_steps
         return updates, updates * settings.policy_rollouts * settings.policy_rollout_length
-
-    @property
-    def _nets(self) -> trpo.Networks:
-        return trpo.make_networks(self.settings, self.spec)
 
 
 def _whitened(scaling: Scaling, obs: jax.Array) -> jax.Array:

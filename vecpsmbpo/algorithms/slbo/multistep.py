@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import optax
 
 from vecpsmbpo import dynamics, networks, optim, replay
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.algorithms.slbo.settings import SlboSettings
 from vecpsmbpo.types import EnvSpec, Hyper, Model, Transition
 
 
@@ -44,7 +44,7 @@ def loss(model: Model, batch: Transition, follows: jax.Array, *, net: networks.G
 
 
 def sequences(
-    real: jax.Array, rows: jax.Array, key: jax.Array, settings: Settings, spec: EnvSpec
+    real: jax.Array, rows: jax.Array, key: jax.Array, settings: SlboSettings, spec: EnvSpec
 ) -> tuple[Transition, jax.Array]:
     """A batch of H consecutive rows of D_E, leaves [B, H, ...], and where each continues the one before, [B, H].
 
@@ -58,7 +58,14 @@ def sequences(
 
 
 def fit(
-    model: Model, real: jax.Array, rows: jax.Array, hyper: Hyper, key: jax.Array, *, settings: Settings, spec: EnvSpec
+    model: Model,
+    real: jax.Array,
+    rows: jax.Array,
+    hyper: Hyper,
+    key: jax.Array,
+    *,
+    settings: SlboSettings,
+    spec: EnvSpec,
 ) -> Model:
     """The model after `model_steps` of Adam. real: D_E, [C, F], of which `rows` were added."""
     net = dynamics.network(settings, spec)

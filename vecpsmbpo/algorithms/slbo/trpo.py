@@ -10,7 +10,7 @@ from jax.scipy.sparse.linalg import cg
 
 from vecpsmbpo import optim
 from vecpsmbpo.algorithms.slbo import networks
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.algorithms.slbo.settings import SlboSettings
 from vecpsmbpo.types import AgentStats, EnvSpec, Params
 
 DAMPING = 0.1  # added to the Fisher matrix
@@ -50,7 +50,7 @@ class Networks(NamedTuple):
     value: networks.StateValue
 
 
-def make_networks(settings: Settings, spec: EnvSpec) -> Networks:
+def make_networks(settings: SlboSettings, spec: EnvSpec) -> Networks:
     size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
     return Networks(networks.GaussianPolicy(spec.action_size, size, layers), networks.StateValue(size, layers))
 
@@ -149,7 +149,7 @@ def policy_step(
 
 
 def update(
-    agent: TrpoAgent, rollouts: Rollouts, discount: jax.Array, key: jax.Array, *, settings: Settings, nets: Networks
+    agent: TrpoAgent, rollouts: Rollouts, discount: jax.Array, key: jax.Array, *, settings: SlboSettings, nets: Networks
 ) -> TrpoAgent:
     """One step of the policy, and the value function refitted to the rollouts' returns."""
     value, next_value = (nets.value.values(agent.value, obs) for obs in (rollouts.obs, rollouts.next_obs))

@@ -1,0 +1,162 @@
+"""The settings of every run, whatever learns."""
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from vecpsmbpo.settings.fields import choice, is_traced, real, whole
+
+Options = tuple[tuple[str, Any], ...]  # name and value of each `env.*` option, in the order of names
+Sweep = tuple[tuple[str, tuple[float, ...]], ...]  # name and values of each `sweep.*`, in the order of names
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """One run, resolved. Hashable: shapes and loop lengths are read from here when a program is traced."""
+
+    # what runs
+    env: str
+    env_options: Options = ()
+    algo: str
+    size: str
+    recipe: str
+    backend: str = choice("auto", "mjx", "host")
+    seed: int = whole(0, 2**31 - 1)
+    num_seeds: int = whole(1)
+    sweep: Sweep = ()
+    total_steps: int = whole(1)
+    run_dir: str
+    # the loop around it
+    epoch_steps: int = whole(1)
+    episode_length: int = whole(0)
+    eval_episodes: int = whole(1)
+    eval_policy: str = choice("posterior", "best", "average")
+    eval_actions: str = choice("mean", "sampled")
+    checkpoint_every: int = whole(1)
+    keep_checkpoints: int = whole(1)
+    report: bool
+    loggers: tuple[str, ...] = choice("tensorboard", "wandb", "mlflow")
+    devices: int = whole(0)
+    compile_cache: bool
+    # real data
+    warmup_steps: int = whole(1)
+    replay_capacity: int = whole(1)
+    forced_exploration: float = real(0, traced=True)
+    # dynamics models (A.1)
+    n_models: int = whole(1)
+    model_hidden_size: int = whole(1)
+    model_hidden_layers: int = whole(1)
+    model_learning_rate: float = real(0, open_low=True, traced=True)
+    model_weight_decay: float = real(0, traced=True)
+    model_batch_size: int = whole(1)
+    model_update_every: int = whole(1)
+    model_patience: int = whole(1)
+    model_improvement: float = real(0, 1)
+    model_max_epochs: int = whole(1)
+    validation_ratio: float = real(0, 0.5, open_low=True)
+    whiten_targets: bool
+    prior_scale: float = real(0, traced=True)
+
+    @property
+    def task(self) -> str:
+        """The task in words: `hopper`, `dm_control finger spin`."""
+        return " ".join([self.env, *(str(value) for _, value in self.env_options)])
+
+    @property
+    def scale(self) -> str:
+        """How much learns, in words."""
+        return f"N = {self.n_models} model(s)"
+
+    @property
+    def policies_per_model(self) -> int:
+        """M, 1 where policies are not counted."""
+        return 1
+
+    @property
+    def n_members(self) -> int:
+        """How many there are of whom one acts."""
+        return 1
+
+    @property
+    def minibatch(self) -> int:
+        """Rows of the minibatches at every step, which devices may divide among them; 1 where there are none."""
+        return 1
+
+    @property
+    def weighs_values(self) -> bool:
+        """Whether members are drawn by what their critics promise, and not by what they have earned."""
+        return False
+
+    @functools.cached_property
+    def lanes(self) -> tuple[dict[str, Any], ...]:
+        """The S learners of the program: every seed with every combination of swept values, as log lines name them."""
+        seeds = [{"seed": self.seed + index} for index in range(self.num_seeds)]
+        names = [name for name, _ in self.sweep]
+        points = itertools.product(*(values for _, values in self.sweep))
+        return tuple({**seed, **dict(zip(names, point, strict=True))} for point in points for seed in seeds)
+
+    @property
+    def traced(self) -> tuple[str, ...]:
+        """The settings that are numbers inside the compiled program (`types.Hyper`)."""
+        return tuple(field.name for field in dataclasses.fields(self) if is_traced(field))
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether models have a random function prior."""
+        return self.prior_scale > 0 or "prior_scale" in dict(self.sweep)
+
+    @property
+    def refreshes_per_epoch(self) -> int:
+        return self.epoch_steps // self.model_update_every
+
+    @property
+    def stride(self) -> int:
+        """Steps after which the host may look at the run, and stop it: the largest divisor of a period up to 25."""
+        return max(steps for steps in range(1, 26) if self.model_update_every % steps == 0)
+
+    @property
+    def first_learning_step(self) -> int:
+        """The first multiple of a period at which the warm-up is over."""
+        return -(-self.warmup_steps // self.model_update_every) * self.model_update_every
+
+    @property
+    def validation_block(self) -> int:
+        """k, when one row in k validates: the split draws one row of every k consecutive ones."""
+        return round(1 / self.validation_ratio)
+
+    def contradictions(self) -> Iterator[tuple[bool, str]]:
+        """Whether settings contradict one another, and how to say so; a subclass adds its own."""
+        yield (
+            self.epoch_steps % self.model_update_every != 0,
+            f"model_update_every={self.model_update_every}: must divide epoch_steps={self.epoch_steps}",
+        )
+        yield (
+            self.total_steps % self.epoch_steps != 0,
+            f"total_steps={self.total_steps}: must be a multiple of epoch_steps={self.epoch_steps}",
+        )
+        yield (
+            self.seed + self.num_seeds > 2**31,
+            f"num_seeds={self.num_seeds}: the last seed, seed + num_seeds - 1, must be at most {2**31 - 1}",
+        )
+        yield (
+            not math.isclose(self.validation_block * self.validation_ratio, 1, rel_tol=1e-2),
+            f"validation_ratio={self.validation_ratio}: must be 1 / k for a whole number k, as one row in k validates",
+        )
+        yield (
+            self.warmup_steps < self.validation_block,
+            f"warmup_steps={self.warmup_steps}: must be at least 1 / validation_ratio = {self.validation_block}",
+        )
+        yield (
+            self.replay_capacity < self.warmup_steps,
+            f"replay_capacity={self.replay_capacity}: must be at least warmup_steps",
+        )
+
+
+# Settings that a resumed run may change: they steer the loop around the run, not what it computes.
+CHANGEABLE = frozenset(
+    {"total_steps", "eval_episodes", "eval_policy", "eval_actions", "checkpoint_every", "report", "devices"}
+    | {"keep_checkpoints", "loggers", "compile_cache"}
+)

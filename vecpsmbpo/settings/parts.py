@@ -1,0 +1,100 @@
+"""Settings that more than one algorithm may have, as the mathematics beside them reads them."""
+
+import dataclasses
+from collections.abc import Iterator
+
+from vecpsmbpo.settings.base import Settings
+from vecpsmbpo.settings.fields import choice, real, whole
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PolicySettings(Settings):
+    """Of learned policies."""
+
+    policy_hidden_size: int = whole(1)
+    policy_hidden_layers: int = whole(1)
+    discount: float = real(0, 1, traced=True)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SacSettings(PolicySettings):
+    """Of `sac` (A.2)."""
+
+    policy_learning_rate: float = real(0, open_low=True, traced=True)
+    policy_batch_size: int = whole(1)
+    updates_per_step: int = whole(1)
+    target_entropy: float = real(traced=True)
+    target_update_rate: float = real(0, 1, open_low=True, traced=True)
+    target_update_every: int = whole(1)
+    critic_norm: str = choice("none", "layer", "rms")
+    clip_targets: bool
+    bound_log_prob: bool
+
+    @property
+    def minibatch(self) -> int:
+        return self.policy_batch_size
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ImaginationSettings(SacSettings):
+    """Of `imagination`, which rolls these policies out."""
+
+    rollout_starts: int = whole(1)
+    imagined_capacity: int = whole(1)
+    horizon_first: int = whole(1)
+    horizon_last: int = whole(1)
+    horizon_ramp_start: float = real(0)
+    horizon_ramp_end: float = real(0)
+    rollout_models: str = choice("own", "any")
+
+    def contradictions(self) -> Iterator[tuple[bool, str]]:
+        yield from super().contradictions()
+        ends = self.horizon_ramp_end > self.horizon_ramp_start
+        yield not ends, "horizon_ramp_end: must be greater than horizon_ramp_start"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PosteriorSettings(Settings):
+    """Of `posterior` and `mixture`: who acts, and from how much real data each learns."""
+
+    n_policies: int = whole(1)
+    real_ratio: float = real(0, 1, traced=True)
+    real_ratio_schedule: str = choice("constant", "linear", "bandit")
+    real_ratio_arms: tuple[float, ...] = real(0, 1)
+    temperature: float = real(0, open_low=True, traced=True)
+    weights: str = choice("returns", "values")
+    posterior: str = choice("sample", "average")
+
+    @property
+    def policies_per_model(self) -> int:
+        return self.n_policies
+
+    @property
+    def adapts_real_ratio(self) -> bool:
+        """Whether λ is chosen online."""
+        return self.real_ratio_schedule == "bandit"
+
+    @property
+    def weighs_values(self) -> bool:
+        return self.weights == "values"
+
+    @property
+    def imagines(self) -> bool:
+        """Whether any lane ever learns from imagined data (λ < 1)."""
+        ratios = dict(self.sweep).get("real_ratio", (self.real_ratio,))
+        if self.adapts_real_ratio:
+            ratios = self.real_ratio_arms
+        return self.real_ratio_schedule == "linear" or min(ratios) < 1
+
+    def contradictions(self) -> Iterator[tuple[bool, str]]:
+        yield from super().contradictions()
+        arms = ", ".join(f"{arm:g}" for arm in self.real_ratio_arms)
+        yield (
+            self.real_ratio_schedule != "constant" and "real_ratio" in dict(self.sweep),
+            "sweep.real_ratio: needs real_ratio_schedule=constant",
+        )
+        yield list(self.real_ratio_arms) != sorted(set(self.real_ratio_arms)), f"real_ratio_arms=[{arms}]: must rise"
+        yield (
+            self.adapts_real_ratio and self.posterior == "average",
+            "posterior=average: no policy earns what real_ratio_schedule=bandit would choose by",
+        )
