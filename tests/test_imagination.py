@@ -8,7 +8,7 @@ import scipy.stats
 
 from tests.helpers import algorithm, initial, tiny
 from vecpsmbpo import health, replay
-from vecpsmbpo.drivers.common import over_seeds
+from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.types import Counters, EnvSpec, Transition
 
 LIMIT = 3.5
@@ -55,17 +55,17 @@ def imagine(settings, change=1.0):
     )
     placed = layout.place(state.replace(seeds=seeds)).seeds
     run = layout.spread(
-        lambda counters, seeds, keys: over_seeds(lambda c, s, k: learner.imagine(c, s, jnp.bool_(True), k))(
-            counters, seeds, keys
-        ),
+        lambda counters, seeds, keys: over_seeds(
+            lambda c, s, k: learner.imagine(c, s, jnp.bool_(True), k), out_axes=(None, 0)
+        )(counters, seeds, keys),
         (specs.counters, specs.seeds, specs.seeds.key),
-        specs.seeds,
+        (specs.counters, specs.seeds),
     )
     counters = Counters(jnp.int32(ROWS), jnp.int32(0))
-    after = run(counters, placed, placed.key)
+    counters, after = run(counters, placed, placed.key)
     added = settings.horizon_last * settings.rollout_starts
     rows = after.imagined[0, : settings.n_members, :added]
-    assert int(learner.imagined_rows(counters, jnp.bool_(True))) == added
+    assert int(counters.imagined_rows) == added
     return [replay.unpack(member, 2, 1) for member in rows], np.asarray(after.real[0]), after.health
 
 

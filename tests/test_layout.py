@@ -12,9 +12,9 @@ import pytest
 
 from tests.helpers import algorithm, environment, initial, tiny
 from vecpsmbpo import sac
-from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs import specs
 from vecpsmbpo.layout import MEMBER_WORK, Layout, _copies, _mesh_shape
+from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.types import Counters, TrainState
 
 SPEC = specs.get("ball_in_cup")

@@ -24,8 +24,8 @@ import numpy as np
 
 from vecpsmbpo import config, envs, runtime
 from vecpsmbpo.drivers import ScanDriver
-from vecpsmbpo.drivers.common import over_seeds
 from vecpsmbpo.envs import registry
+from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.training.programs import initial_inputs, make_driver
 from vecpsmbpo.types import TrainState

@@ -22,6 +22,7 @@ from vecpsmbpo.types import EpisodeEnd, TrainState
 
 METRICS_FILE, EPISODES_FILE = "metrics.jsonl", "episodes.jsonl"
 SESSIONS_FILE = "sessions.jsonl"
+LEARNED = ("critic_loss", "actor_loss", "alpha", "q_mean", "entropy")  # in every line, null where nothing learns so
 Line = dict[str, Any]
 
 
@@ -167,6 +168,7 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
                 "train_episodes": int(episodes),
                 "unsound_steps": int(seeds.epoch_unsound[seed]),
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
+                **dict.fromkeys(LEARNED),
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
                 "real_ratio": None if ratios is None else _number(np.asarray(ratios[seed], np.float64).mean()),
                 "temperature": None if ratios is None else _number(seeds.hyper.temperature[seed]),

@@ -58,7 +58,6 @@ def sample_newest_indices(
     return (added - 1 - age) % capacity
 
 
-def count(added: jax.Array, new: jax.Array, capacity: int) -> jax.Array:
-    """`added + new`, less whole turns of a full ring: position and fullness stay, and int32 never overflows."""
-    total = added + new
-    return jnp.where(total < capacity, total, capacity + total % capacity)
+def count(added: jax.Array, capacity: int) -> jax.Array:
+    """The `added` rows, less whole turns of a full ring: position and fullness stay, and int32 never overflows."""
+    return jnp.where(added < capacity, added, capacity + added % capacity)

@@ -9,10 +9,34 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from vecpsmbpo import networks, optim
 from vecpsmbpo.settings.parts import SacSettings
-from vecpsmbpo.types import Agent, AgentStats, EnvSpec, Hyper, Params, Transition
+from vecpsmbpo.types import EnvSpec, Hyper, Params, Stats, Transition
+
+
+class SacStats(Stats):
+    """What an update reports."""
+
+    critic_loss: jax.Array
+    actor_loss: jax.Array
+    alpha: jax.Array
+    q_mean: jax.Array
+    entropy: jax.Array
+
+
+class Agent(struct.PyTreeNode):
+    """Networks, target, temperature α, and the state of Adam for each."""
+
+    actor: Params
+    critic: Params
+    target_critic: Params
+    log_alpha: jax.Array
+    actor_optimizer: Any
+    critic_optimizer: Any
+    alpha_optimizer: Any
+    stats: SacStats
 
 
 class Networks(NamedTuple):
@@ -60,7 +84,7 @@ def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> Agent:
         actor_optimizer=optim.init(actor),
         critic_optimizer=optim.init(critic),
         alpha_optimizer=optim.init(log_alpha),
-        stats=AgentStats.zero(),
+        stats=SacStats.zero(),
     )
 
 
@@ -160,7 +184,7 @@ def update(
     target_critic = jax.tree.map(
         lambda average, new: average + target_rate * (new - average), agent.target_critic, critic
     )
-    news = AgentStats(
+    news = SacStats(
         updates=jnp.ones(()),
         critic_loss=loss_q,
         actor_loss=loss_pi,

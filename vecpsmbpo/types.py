@@ -6,7 +6,7 @@ members (rounded up to the mesh, see `layout`), B batch, T time, O observation, 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -117,38 +117,17 @@ class Model(struct.PyTreeNode):
     prior: Prior | None
 
 
-class AgentStats(struct.PyTreeNode):
-    """Sums over this epoch's SAC updates of one member; every leaf []."""
+class Stats(struct.PyTreeNode):
+    """Sums over this epoch's updates of one member; every leaf [].
+
+    An algorithm adds a field for each number that its updates report: the mean over updates is logged by that name.
+    """
 
     updates: jax.Array
-    critic_loss: jax.Array
-    actor_loss: jax.Array
-    alpha: jax.Array
-    q_mean: jax.Array
-    entropy: jax.Array
 
     @classmethod
-    def zero(cls) -> "AgentStats":
+    def zero(cls) -> Self:
         return cls(*jnp.zeros(len(cls.__dataclass_fields__)))
-
-
-class Planner(struct.PyTreeNode):
-    """A member that plans: it has nothing to learn."""
-
-    stats: AgentStats
-
-
-class Agent(struct.PyTreeNode):
-    """One soft actor-critic: networks, target, temperature α, and the state of Adam for each."""
-
-    actor: Params
-    critic: Params
-    target_critic: Params
-    log_alpha: jax.Array
-    actor_optimizer: Any
-    critic_optimizer: Any
-    alpha_optimizer: Any
-    stats: AgentStats
 
 
 class Posterior(struct.PyTreeNode):
@@ -267,7 +246,7 @@ class SeedState(struct.PyTreeNode):
         key: typed PRNG key.
         hyper: see `Hyper`.
         models: `Model` with leading [N].
-        agents: `Agent`, or what another algorithm has for it, with leading [P].
+        agents: what the algorithm has for a member, such as `sac.Agent`, with leading [P].
         real: [C, F], D_E: packed transitions, a ring.
         newest: [F], the row that `real` received last; zeros before the first. (Reading it from a ring that is written
             in the same step makes XLA copy the ring.)

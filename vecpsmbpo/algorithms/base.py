@@ -31,7 +31,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def init_agent(self, key: jax.Array) -> Any:
-        """One member; its sums over an epoch are in its `stats` (`types.AgentStats`)."""
+        """One member; its sums over an epoch are in its `stats` (`types.Stats`)."""
 
     @abstractmethod
     def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
@@ -48,8 +48,11 @@ class Algorithm(ABC):
         """The action [A] for obs [O] at a step of an evaluation episode, from 0, and what it will remember."""
 
     @abstractmethod
-    def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
-        """What happens where a period of `model_update_every` steps begins; nothing where not `enabled`."""
+    def refresh(
+        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+    ) -> tuple[Counters, SeedState]:
+        """What happens where a period of `model_update_every` steps begins; nothing where not `enabled`. The counters
+        must not depend on the seed's state."""
 
     @abstractmethod
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
@@ -85,10 +88,6 @@ class Algorithm(ABC):
     def ring_capacity(self) -> int:
         """C_M: rows that are imagined for a member and kept."""
         return 1
-
-    def imagined_rows(self, counters: Counters, enabled: jax.Array) -> jax.Array:
-        """The counter of `counters` after `refresh`."""
-        return counters.imagined_rows
 
     def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Any:
         """The agents after what is learned at every step."""
@@ -244,7 +243,7 @@ class Algorithm(ABC):
             keys = self.layout.keys(fit_key, self.layout.model_ids())
             return self.layout.map_local(fit, models, keys, shared=(state.real, split, whitening, state.hyper))
 
-        # Only the models go through the branch: see `drivers.common.observe_and_learn`.
+        # Only the models go through the branch: see `schedule.observe_and_learn`.
         return state.replace(models=jax.lax.cond(enabled, fitted, lambda models: models, state.models))
 
 

@@ -1,7 +1,6 @@
-"""What both drivers share: the order in which an algorithm's functions are called, and what a driver can do.
+"""What both drivers share, apart from the order in which an algorithm's functions are called (`schedule`).
 
-A period is `model_update_every` steps: it begins with a refresh (models refitted, imagination renewed); then every step
-acts, observes and learns. A chunk is a number of strides, a few steps each, decided when the program is called: one
+A chunk is a number of strides, a few steps each, decided when the program is called: one
 compiled program serves chunks of any length, and how a run is cut into chunks does not change it. A stride is also what
 is undone in a lane where something stops being finite (`health`): its news are none.
 """
@@ -19,7 +18,7 @@ from jax.sharding import PartitionSpec
 
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.layout import SEEDS, Layout
-from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
+from vecpsmbpo.types import EpisodeEnd, Hyper, TrainState
 
 SHARED, BY_SEED = PartitionSpec(), PartitionSpec(SEEDS)
 
@@ -88,61 +87,7 @@ def compiled(programs: Sequence[tuple[Any, tuple]]) -> tuple[list[Any], float]:
     return executables, time.perf_counter() - began
 
 
-# ── what both drivers run, for this device's share ───────────────────────────────────────────────────────────────
-
-
-def over_seeds(function: Callable) -> Callable:
-    """`function` of (counters, state of one seed, ...) for every seed of this device; counters are shared."""
-
-    def batched(counters, *args):
-        return jax.vmap(lambda *one: function(counters, *one))(*args)
-
-    return batched
-
-
-def begin_stride(algorithm: Algorithm, state: TrainState) -> tuple[TrainState, jax.Array]:
-    """Refreshes models and imagined data where a period begins, and says whether this period learns: not before the
-    warm-up is over.
-    """
-    counters, seeds = state.counters, state.seeds
-    into_period = counters.env_steps % algorithm.settings.model_update_every
-    learning = counters.env_steps - into_period >= algorithm.settings.warmup_steps
-    advanced, keys = split_keys(seeds, 1)
-    seeds = seeds.replace(key=jnp.where(into_period == 0, advanced.key, seeds.key))
-    seeds = over_seeds(algorithm.begin_epoch)(counters, seeds)
-    needed = algorithm.layout.any_seed(over_seeds(algorithm.refreshes)(counters, seeds))
-    imagining = (into_period == 0) & learning & needed
-    seeds = over_seeds(lambda c, s, k: algorithm.refresh(c, s, imagining, k))(counters, seeds, keys[:, 0])
-    counters = counters._replace(imagined_rows=algorithm.imagined_rows(counters, imagining))
-    return state.replace(counters=counters, seeds=seeds), learning
-
-
-def split_keys(seeds: SeedState, count: int) -> tuple[SeedState, jax.Array]:
-    """Takes `count` keys [S, count] from every seed's own."""
-    keys = jax.vmap(lambda key: jax.random.split(key, count + 1))(seeds.key)
-    return seeds.replace(key=keys[:, 0]), keys[:, 1:]
-
-
-def observe_and_learn(
-    algorithm: Algorithm,
-    counters: Counters,
-    seeds: SeedState,
-    transition: Transition,
-    truncated: jax.Array,
-    keys: jax.Array,
-    learning: jax.Array,
-) -> tuple[Counters, SeedState, EpisodeEnd]:
-    """What follows every real step. transition leaves [S, ...], truncated [S], keys [S, 2]."""
-    seeds, end = over_seeds(algorithm.observe)(counters, seeds, transition, truncated, keys[:, 0])
-    counters = counters._replace(env_steps=counters.env_steps + 1)
-    # Only the agents go through the branch: a conditional that returned the buffers would copy them.
-    agents = jax.lax.cond(
-        learning,
-        lambda seeds: over_seeds(algorithm.learn)(counters, seeds, keys[:, 1]),
-        lambda seeds: seeds.agents,
-        seeds,
-    )
-    return counters, seeds.replace(agents=agents), end
+# ── evaluation ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def evaluation_policies(algorithm: Algorithm) -> Callable:

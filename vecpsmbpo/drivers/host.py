@@ -16,17 +16,14 @@ from vecpsmbpo.drivers.common import (
     COMPILED_QUICKLY,
     SHARED,
     Returns,
-    begin_stride,
     compiled,
     evaluation_actions,
     evaluation_policies,
     many,
-    observe_and_learn,
-    over_seeds,
     split_for_episodes,
-    split_keys,
 )
 from vecpsmbpo.envs.host.batched import HostEnv
+from vecpsmbpo.schedule import begin_stride, observe_and_learn, over_seeds, split_keys
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
 
@@ -51,10 +48,10 @@ class HostDriver:
         spread, before = self.layout.spread, specs.without_rings()
         self._init = spread(self._init_local, (BY_SEED,) * 3, specs, compiler_options=COMPILED_QUICKLY)
         self._begin = spread(self._begin_local, (specs,), (before, specs, SHARED), donate_argnums=0)
-        self._act = spread(self._act_local, (specs.counters, seeds, BY_SEED), (BY_SEED, BY_SEED, BY_SEED))
+        self._act = spread(self._act_local, (specs.counters, seeds, BY_SEED), (BY_SEED,) * 4)
         self._observe = spread(
             self._observe_local,
-            (specs, BY_SEED, BY_SEED, BY_SEED, BY_SEED, BY_SEED, SHARED),
+            (specs, *(BY_SEED,) * 6, SHARED),
             (specs, BY_SEED),
             donate_argnums=0,
         )
@@ -76,7 +73,7 @@ class HostDriver:
     def compile(self, state: TrainState) -> None:
         spec, seeds, episodes = self.algorithm.spec, self.layout.num_seeds, self.settings.eval_episodes
         obs, number = self._shape(spec.obs_size), self._shape()
-        action, memory, keys = jax.eval_shape(self._act, state.counters, state.seeds, obs)
+        action, memory, key, keys = jax.eval_shape(self._act, state.counters, state.seeds, obs)
         before, _, learning = jax.eval_shape(self._begin, state)
         transition, flag = Transition(obs, action, number, obs, number), jax.ShapeDtypeStruct((seeds,), bool)
         episode_keys = jax.eval_shape(lambda key: split_for_episodes(key, episodes).actions, state.seeds.key)
@@ -86,7 +83,7 @@ class HostDriver:
         programs = [
             (self._begin, (state,)),
             (self._act, (state.counters, state.seeds, obs)),
-            (self._observe, (state, memory, transition, flag, keys, obs, learning)),
+            (self._observe, (state, memory, transition, flag, key, keys, obs, learning)),
             (self._settle, (before, state)),
             (self._policies, (state.seeds, state.seeds.key)),
             (self._evaluation_actions, (policies, jnp.int32(0), remembered, states, episode_keys)),
@@ -109,11 +106,11 @@ class HostDriver:
 
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
         obs = state.env
-        action, memory, keys = self._act(state.counters, state.seeds, obs)
+        action, memory, key, keys = self._act(state.counters, state.seeds, obs)
         step = self._env.step(np.asarray(action))
         terminated = step.terminated.astype(np.float32)
         transition = Transition(*map(jnp.asarray, (obs, action, step.reward, step.next_obs, terminated)))
-        state, end = self._observe(state, memory, transition, step.truncated, keys, step.obs, learning)
+        state, end = self._observe(state, memory, transition, step.truncated, key, keys, step.obs, learning)
         return state, jax.tree.map(np.asarray, end)
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
@@ -157,11 +154,10 @@ class HostDriver:
     def _begin_local(self, state: TrainState) -> tuple[TrainState, TrainState, jax.Array]:
         return state.without_rings(), *begin_stride(self.algorithm, state)
 
-    def _act_local(self, counters: Counters, seeds: SeedState, obs: jax.Array) -> tuple[jax.Array, Any, jax.Array]:
-        # The key is not advanced here but in `_observe_local`, which splits the same one: acting needs no copy of
-        # the state, and changes nothing.
-        _, keys = split_keys(seeds, 3)
-        return *over_seeds(self.algorithm.act)(counters, seeds, obs, keys[:, 0]), keys[:, 1:]
+    def _act_local(self, counters: Counters, seeds: SeedState, obs: jax.Array) -> tuple[jax.Array, ...]:
+        # What acting changes, memory and key, goes to `_observe_local` beside the state: acting needs no copy of it.
+        advanced, keys = split_keys(seeds, 3)
+        return *over_seeds(self.algorithm.act)(counters, seeds, obs, keys[:, 0]), advanced.key, keys[:, 1:]
 
     def _observe_local(
         self,
@@ -169,11 +165,12 @@ class HostDriver:
         memory: Any,
         transition: Transition,
         truncated: jax.Array,
+        key: jax.Array,
         keys: jax.Array,
         obs: jax.Array,
         learning: jax.Array,
     ) -> tuple[TrainState, EpisodeEnd]:
-        seeds, _ = split_keys(state.seeds.replace(memory=memory), 3)
+        seeds = state.seeds.replace(memory=memory, key=key)
         counters, seeds, end = observe_and_learn(
             self.algorithm, state.counters, seeds, transition, truncated, keys, learning
         )

@@ -15,16 +15,13 @@ from vecpsmbpo.drivers.common import (
     SHARED,
     EpisodeKeys,
     Returns,
-    begin_stride,
     compiled,
     evaluation_actions,
     many,
-    observe_and_learn,
-    over_seeds,
     split_for_episodes,
-    split_keys,
 )
 from vecpsmbpo.layout import SEEDS
+from vecpsmbpo.schedule import begin_stride, observe_and_learn, over_seeds, split_keys
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
 

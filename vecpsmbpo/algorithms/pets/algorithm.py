@@ -5,11 +5,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.pets import planning
 from vecpsmbpo.algorithms.pets.settings import PetsSettings
-from vecpsmbpo.types import AgentStats, Counters, Model, Planner, SeedState
+from vecpsmbpo.types import Counters, Model, SeedState, Stats
+
+
+class Planner(struct.PyTreeNode):
+    """A member that plans: it has nothing to learn."""
+
+    stats: Stats
 
 
 class Pets(Algorithm):
@@ -18,7 +25,7 @@ class Pets(Algorithm):
     settings: PetsSettings
 
     def init_agent(self, key: jax.Array) -> Planner:
-        return Planner(stats=AgentStats.zero())
+        return Planner(stats=Stats.zero())
 
     def memory(self) -> jax.Array:
         """The plan [H, A], whose first action is taken now: of the middle of every range."""
@@ -39,8 +46,10 @@ class Pets(Algorithm):
         """As `choose`: planning is the same in training and evaluation."""
         return self._follow(step % self.settings.plan_hold == 0, policy, memory, obs, key)
 
-    def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
-        return self.fit_models(counters, state, enabled, key)
+    def refresh(
+        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+    ) -> tuple[Counters, SeedState]:
+        return counters, self.fit_models(counters, state, enabled, key)
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         """A plan is made for every `plan_hold` steps, and imagines as many for each planned action."""

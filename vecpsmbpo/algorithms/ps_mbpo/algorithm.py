@@ -14,7 +14,8 @@ import numpy as np
 from vecpsmbpo import health, imagination, mixture, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
-from vecpsmbpo.types import Agent, Counters, Hyper, Params, Posterior, SeedState, Transition
+from vecpsmbpo.sac import Agent
+from vecpsmbpo.types import Counters, Hyper, Params, Posterior, SeedState, Transition
 
 
 class PsMbpo(Algorithm):
@@ -160,16 +161,20 @@ class PsMbpo(Algorithm):
         last = counters._replace(env_steps=counters.env_steps + self.settings.model_update_every)
         return jnp.any(self.real_ratios(last, state) < 1)
 
-    def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
-        """Refits the models and renews the imagined data (Algorithm 1, lines 2, 9 and 10)."""
+    def refresh(
+        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+    ) -> tuple[Counters, SeedState]:
+        """Refits the models and renews the imagined data (Algorithm 1, lines 2 and 8 to 10)."""
         fit_key, imagine_key = jax.random.split(key)
         state = self.fit_models(counters, state, enabled, fit_key)
         return self.imagine(counters, state, enabled, imagine_key)
 
-    def imagine(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
+    def imagine(
+        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+    ) -> tuple[Counters, SeedState]:
         """Rolls every member (n, m) out in model n from real states (lines 9 and 10), into its own ring.
 
-        Adds `imagined_rows` rows to every ring: a row whose rollout terminates goes on from a fresh real state, so
+        Adds as many rows to every ring: a row whose rollout terminates goes on from a fresh real state, so
         that shapes stay fixed and every stored row is valid. Rows that are not finite, of a model or policy beyond
         help, are stored as zeros, and the lane is frozen before anything is kept that was learned from them.
         """
@@ -207,16 +212,12 @@ class PsMbpo(Algorithm):
             return imagined, sound, rows
 
         start = (state.imagined, jnp.ones(ids.shape, bool), counters.imagined_rows)
-        imagined, sound, _ = jax.lax.fori_loop(0, chunks, rollout, start)
+        imagined, sound, rows = jax.lax.fori_loop(0, chunks, rollout, start)
+        counters = counters._replace(imagined_rows=replay.count(rows, self.ring_capacity))
         sound |= ids >= layout.n_members
         first = layout.least_of_members(jnp.min(jnp.where(sound, layout.n_members, ids)))
         noted = health.note(state.health, health.IMAGINED, first < layout.n_members, first)
-        return state.replace(imagined=imagined, health=noted)
-
-    def imagined_rows(self, counters: Counters, enabled: jax.Array) -> jax.Array:
-        """The counter of `counters` after `imagine`."""
-        new = jnp.where(enabled, imagination.rows_per_refresh(self.settings, counters.env_steps), 0)
-        return replay.count(counters.imagined_rows, new, self.ring_capacity)
+        return counters, state.replace(imagined=imagined, health=noted)
 
     # ── learn: every step ────────────────────────────────────────────────────────────────────────────────────
 

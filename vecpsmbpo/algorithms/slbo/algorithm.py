@@ -47,7 +47,9 @@ class Slbo(Algorithm):
         """That the policy was trained with: of its model, at the last refresh."""
         return jax.tree.map(lambda x: x[0], self.layout.all_models(state.models.scaling))
 
-    def refresh(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
+    def refresh(
+        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+    ) -> tuple[Counters, SeedState]:
         """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""
         layout = self.layout
         whitening = dynamics.scaling(state.moments, counters.env_steps, self.settings)
@@ -78,7 +80,7 @@ class Slbo(Algorithm):
             return layout.map_local(learn, models, agents, keys, shared=shared)
 
         models, agents = jax.lax.cond(enabled, learned, lambda *same: same, state.models, state.agents)
-        return state.replace(models=models, agents=agents)
+        return counters, state.replace(models=models, agents=agents)
 
     def rollouts(
         self, counters: Counters, real: jax.Array, model: Model, policy: Params, key: jax.Array

@@ -11,12 +11,21 @@ from jax.scipy.sparse.linalg import cg
 from vecpsmbpo import optim
 from vecpsmbpo.algorithms.slbo import networks
 from vecpsmbpo.algorithms.slbo.settings import SlboSettings
-from vecpsmbpo.types import AgentStats, EnvSpec, Params
+from vecpsmbpo.types import EnvSpec, Params, Stats
 
 DAMPING = 0.1  # added to the Fisher matrix
 CG_ITERATIONS = 10
 LINE_SEARCH_STEPS = 10  # each half as long as the one before
 VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 20, 256, 1e-3  # of Adam, after each step of the policy
+
+
+class TrpoStats(Stats):
+    """What an update reports."""
+
+    critic_loss: jax.Array
+    actor_loss: jax.Array
+    q_mean: jax.Array
+    entropy: jax.Array
 
 
 class TrpoAgent(struct.PyTreeNode):
@@ -25,7 +34,7 @@ class TrpoAgent(struct.PyTreeNode):
     policy: Params
     value: Params
     value_optimizer: Any
-    stats: AgentStats
+    stats: TrpoStats
 
 
 class Rollouts(NamedTuple):
@@ -59,7 +68,7 @@ def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> TrpoAgent:
     policy_key, value_key = jax.random.split(key)
     obs = jnp.zeros(spec.obs_size)
     value = nets.value.init(value_key, obs)
-    return TrpoAgent(nets.policy.init(policy_key, obs), value, optim.init(value), AgentStats.zero())
+    return TrpoAgent(nets.policy.init(policy_key, obs), value, optim.init(value), TrpoStats.zero())
 
 
 def advantages(
@@ -176,11 +185,10 @@ def update(
 
     start = agent.value, agent.value_optimizer
     (fitted, optimizer), losses = jax.lax.scan(value_step, start, jax.random.split(key, VALUE_STEPS))
-    news = AgentStats(
+    news = TrpoStats(
         updates=jnp.ones(()),
         critic_loss=jnp.mean(losses),
         actor_loss=-gain,
-        alpha=jnp.zeros(()),
         q_mean=jnp.mean(value),
         entropy=jnp.mean(nets.policy.law(policy, obs).entropy()),
     )
