@@ -164,20 +164,20 @@ def update(
     alpha = jnp.exp(agent.log_alpha)
     bounds = None if limits is None else target_range(limits, alpha, hyper, batch.action.shape[-1])
     critic_value_and_grad = jax.value_and_grad(critic_loss, has_aux=True)
-    (loss_q, q_mean), gradient = mean(
+    (loss_q, q_mean), critic_gradient = mean(
         critic_value_and_grad(agent.critic, agent, batch, hyper.discount, noise.next_action, nets=nets, bounds=bounds)
     )
-    critic, critic_optimizer = optim.step(gradient, agent.critic_optimizer, agent.critic, rate)
+    critic, critic_optimizer = optim.step(critic_gradient, agent.critic_optimizer, agent.critic, rate)
 
     actor_value_and_grad = jax.value_and_grad(actor_loss, has_aux=True)
-    (loss_pi, log_prob), gradient = mean(
+    (loss_pi, log_prob), actor_gradient = mean(
         actor_value_and_grad(agent.actor, critic, alpha, batch.obs, noise.action, nets=nets)
     )
-    actor, actor_optimizer = optim.step(gradient, agent.actor_optimizer, agent.actor, rate)
+    actor, actor_optimizer = optim.step(actor_gradient, agent.actor_optimizer, agent.actor, rate)
 
     # ∂/∂(log α) of E[-α (log π + target entropy)]: entropy below its target raises α.
-    gradient = -alpha * (log_prob + hyper.target_entropy)
-    log_alpha, alpha_optimizer = optim.step(gradient, agent.alpha_optimizer, agent.log_alpha, rate)
+    alpha_gradient = -alpha * (log_prob + hyper.target_entropy)
+    log_alpha, alpha_optimizer = optim.step(alpha_gradient, agent.alpha_optimizer, agent.log_alpha, rate)
 
     due = critic_optimizer.count % target_every == 0
     target_rate = jnp.where(due, hyper.target_update_rate, 0.0)
