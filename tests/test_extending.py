@@ -1,0 +1,80 @@
+"""What docs/extending.md promises: each of its patches touches the files named there, and trains."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.helpers import environment
+from vecpsmbpo import metrics
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = sorted((ROOT / "docs" / "examples").glob("new_*.diff"))
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_a_patch_touches_only_the_files_that_the_document_names(example):
+    text = (ROOT / "docs" / "extending.md").read_text()
+    section = next(part for part in text.split("\n## ") if f"docs/examples/{example.name}" in part)
+    named = set(re.findall(r"^\| `([^`]+)` \|", section, re.MULTILINE))
+    touched = set(re.findall(r"^\+\+\+ b/(.+)$", example.read_text(), re.MULTILINE))
+    assert touched == named
+
+
+@pytest.fixture(scope="module")
+def extended(tmp_path_factory):
+    """A folder with the package as it is with all patches, to be imported from."""
+    copy, site = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("site")
+    for name in ("vecpsmbpo", "envs", "configs"):
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", copy)
+    for example in EXAMPLES:
+        subprocess.run(["git", "apply", str(example)], cwd=copy, check=True)
+    (copy / "vecpsmbpo").rename(site / "vecpsmbpo")
+    for name in ("envs", "configs"):  # as pyproject.toml maps them
+        (copy / name).rename(site / "vecpsmbpo" / name)
+    return site
+
+
+def train(site: Path, run_dir: Path, *words: str) -> tuple[list[dict], list[dict]]:
+    """The lines of a tiny run."""
+    argv = [sys.executable, "-m", "vecpsmbpo.cli", "train", "env=cartpole_swingup", "size=tiny", "backend=host"]
+    result = subprocess.run(
+        [*argv, f"run_dir={run_dir}", *words],
+        cwd=run_dir.parent,
+        env={**environment(), "PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert result.returncode == 0, result.stderr
+    return metrics.read(run_dir / "metrics.jsonl"), metrics.read(run_dir / "episodes.jsonl")
+
+
+def test_a_new_algorithm_trains(extended, tmp_path):
+    words = ["algo=random_shooting", "shooting_plans=8", "shooting_horizon=3"]
+    epochs, episodes = train(extended, tmp_path / "run", *words)
+    assert [line["env_steps"] for line in epochs] == [40, 80, 120]
+    assert np.isfinite([line["eval_return"] for line in epochs]).all()
+    assert epochs[-1]["model_loss"] is not None
+    assert epochs[-1]["critic_loss"] is None  # nothing learns so
+    assert all(line["probs"] == [[1.0]] for line in episodes)
+
+
+def test_a_new_rule_and_a_new_number_are_logged(extended, tmp_path):
+    temperature = 0.1
+    epochs, episodes = train(extended, tmp_path / "run", "weights=means", f"temperature={temperature}")
+    assert epochs[-1]["actor_gradient"] > 0
+    earned, counts = np.zeros((2, 2)), np.zeros((2, 2))
+    for line in episodes:
+        logits = earned / np.maximum(counts, 1) / temperature
+        expected = np.exp(logits - logits.max())
+        np.testing.assert_allclose(line["probs"], expected / expected.sum(), atol=1e-5)
+        if not line["random"]:
+            earned[line["model"], line["policy"]] += line["return"]
+            counts[line["model"], line["policy"]] += 1
+    assert counts.sum() >= 2
