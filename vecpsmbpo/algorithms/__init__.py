@@ -22,21 +22,23 @@ class Entry(NamedTuple):
     Attributes:
         settings: the class of its settings.
         place: `module:class` of what learns.
+        format: of its checkpoints; a state that gains or loses fields has another one.
     """
 
     settings: type[Settings]
     place: str
+    format: int
 
 
-_PS_MBPO = Entry(PsMbpoSettings, "vecpsmbpo.algorithms.ps_mbpo.algorithm:PsMbpo")
+_PS_MBPO = Entry(PsMbpoSettings, "vecpsmbpo.algorithms.ps_mbpo.algorithm:PsMbpo", format=2)
 
 TABLE = {
     "ops_mbpo": _PS_MBPO,
     "ps_mbpo": _PS_MBPO,
     "mbpo": _PS_MBPO,
     "sac": _PS_MBPO,
-    "pets": Entry(PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets"),
-    "slbo": Entry(SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo"),
+    "pets": Entry(PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=3),
+    "slbo": Entry(SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo", format=3),
 }
 
 
