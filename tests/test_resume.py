@@ -17,7 +17,7 @@ import pytest
 
 import vecpsmbpo
 from tests.helpers import argv, assert_probabilities_follow, check_log, command, environment, tiny
-from vecpsmbpo import config, evaluate, metrics, training
+from vecpsmbpo import config, evaluate, jsonl, metrics, training
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.training import guards
 
@@ -250,14 +250,14 @@ def test_a_run_goes_on_where_the_system_has_no_locks(tmp_path, monkeypatch):
 
 def test_a_disk_that_fills_up_stops_the_run_in_one_line(short_run, tmp_path, monkeypatch):
     """Not at the check before a save, but while a line is written; the checkpoint before it is whole."""
-    append = metrics._append
+    append = jsonl.Growing.append
 
-    def full(path, lines):
+    def full(file, lines):
         if any(line["env_steps"] > 60 for line in lines):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        append(path, lines)
+        append(file, lines)
 
-    monkeypatch.setattr(metrics, "_append", full)
+    monkeypatch.setattr(jsonl.Growing, "append", full)
     settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
     with pytest.raises(training.DiskError, match=r"cannot be written \(No space left on device\)"):
         training.train(settings)
