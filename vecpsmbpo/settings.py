@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import itertools
 import math
+import struct
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -14,12 +15,17 @@ Range = tuple[float | None, float | None]
 Options = tuple[tuple[str, Any], ...]  # name and value of each `env.*` option, in the order of names
 Sweep = tuple[tuple[str, tuple[float, ...]], ...]  # name and values of each `sweep.*`, in the order of names
 
+# What the program's int32 and float32 hold; smaller numbers are taken for 0.
+LARGEST_WHOLE = 2**31 - 1
+LARGEST, SMALLEST = 3.4e38, 1.2e-38
+MOST_LANES = 10_000
+
 
 class SettingError(Exception):
     """A mistake in a setting: one line that names the setting and what it may be."""
 
 
-def _whole(at_least: int, at_most: int | None = None) -> Any:
+def _whole(at_least: int, at_most: int = LARGEST_WHOLE) -> Any:
     return dataclasses.field(metadata={"range": (at_least, at_most)})
 
 
@@ -42,7 +48,7 @@ class Settings:
     size: str
     recipe: str
     backend: str = _choice("auto", "mjx", "host")
-    seed: int = _whole(0, 2**31 - 1)
+    seed: int = _whole(0)
     num_seeds: int = _whole(1)
     sweep: Sweep = ()
     total_steps: int = _whole(1)
@@ -234,7 +240,7 @@ def allowed(name: str) -> str:
     kind = kinds[field.type]
     low, high = field.metadata.get("range", (None, None))
     above = "above" if field.metadata.get("open_low") else "at least"
-    if low is not None and high is not None:
+    if low is not None and high not in (None, LARGEST_WHOLE):
         return f"{kind} from {low} to {high}" if above == "at least" else f"{kind} above {low} and at most {high}"
     return kind if low is None else f"{kind}, {above} {low}"
 
@@ -282,8 +288,12 @@ def _number(field: Any, value: Any, complaint: SettingError) -> Any:
         raise complaint
     low, high = field.metadata.get("range", (None, None))
     too_low = low is not None and (number < low or (number == low and field.metadata.get("open_low", False)))
+    if field.type is int and number > LARGEST_WHOLE:
+        raise SettingError(f"{field.name}={value}: must be at most {LARGEST_WHOLE}")
     if too_low or (high is not None and number > high):
         raise complaint
+    if field.type is not int and number and not SMALLEST <= abs(number) <= LARGEST and math.isfinite(number):
+        raise SettingError(f"{field.name}={value}: must be 0 or between {SMALLEST} and {LARGEST} in size")
     return number
 
 
@@ -297,7 +307,10 @@ def check_sweep(name: str, values: Any) -> tuple[float, ...]:
         raise SettingError(f"sweep.{name}: cannot be swept in one program (-m can); one of {', '.join(TRACED)}")
     if not isinstance(values, list | tuple) or not values:
         raise SettingError(f"sweep.{name}={values}: must be a list of values, each {allowed(name)}")
-    return tuple(check(name, value) for value in values)
+    checked = tuple(check(name, value) for value in values)
+    if len({struct.pack("f", value) for value in checked}) < len(checked):
+        raise SettingError(f"sweep.{name}={list(values)}: two of its values are the same in float32")
+    return checked
 
 
 def build(values: Mapping[str, Any]) -> Settings:
@@ -329,6 +342,11 @@ def _contradictions(one: Settings) -> Iterator[tuple[bool, str]]:
     yield (
         one.seed + one.num_seeds > 2**31,
         f"num_seeds={one.num_seeds}: the last seed, seed + num_seeds - 1, must be at most {2**31 - 1}",
+    )
+    lanes = one.num_seeds * math.prod(len(values) for _, values in one.sweep)
+    yield (
+        lanes > MOST_LANES,
+        f"num_seeds={one.num_seeds}: at most {MOST_LANES} seeds, each swept value counted, not {lanes}",
     )
     yield one.horizon_ramp_end <= one.horizon_ramp_start, "horizon_ramp_end: must be greater than horizon_ramp_start"
     yield (
