@@ -18,7 +18,7 @@ import pytest
 from tests import probes
 from tests.helpers import algorithm, argv, initial, tiny
 from tests.test_resume import without_times
-from vecpsmbpo import checkpoint, evaluate, health, metrics, replay, training
+from vecpsmbpo import checkpoint, evaluate, health, jsonl, replay, training
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.training import programs
@@ -330,6 +330,6 @@ def test_what_passes_by_within_a_stride_counts(what, member, words, settled):
 
 def test_log_lines_are_json_whatever_is_in_them():
     line = {"a": float("nan"), "b": [1.0, float("inf"), [-float("inf")]], "c": "inf", "d": None, "e": 2}
-    assert json.loads(metrics._json(line), parse_constant=pytest.fail) == {
+    assert json.loads(jsonl.text_of(line), parse_constant=pytest.fail) == {
         "a": None, "b": [1.0, None, [None]], "c": "inf", "d": None, "e": 2,
     }  # fmt: skip

@@ -17,7 +17,7 @@ import pytest
 
 import vecpsmbpo
 from tests.helpers import argv, assert_probabilities_follow, check_log, command, environment, tiny
-from vecpsmbpo import config, evaluate, metrics, training
+from vecpsmbpo import config, evaluate, jsonl, metrics, recorded, training
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.training import guards
 
@@ -170,8 +170,9 @@ def short_run(tmp_path_factory):
 
 
 @pytest.mark.parametrize("posterior", ["sample", "average"])
-def test_a_policy_is_loaded_from_a_run(posterior, short_run, tmp_path):
+def test_a_policy_is_loaded_from_a_run(posterior, short_run, tmp_path, monkeypatch):
     """Of the best member, or of all where they act together; mean actions against a forward pass written in numpy."""
+    monkeypatch.setattr(recorded, "check", lambda *args: None)  # it was trained with one of them
     shutil.copytree(short_run.run_dir, tmp_path / "run")
     config.save(dataclasses.replace(short_run, posterior=posterior, run_dir=str(tmp_path / "run")), tmp_path / "run")
     run = vecpsmbpo.load(tmp_path / "run")
@@ -237,6 +238,92 @@ def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp
     assert {path.name for path in (folder / "checkpoints").iterdir()} >= {"80", "120"}
 
 
+def _flip(path: Path, at: float = 0.5, bit: int = 4) -> None:
+    """One bit, at a fraction of a file."""
+    content = bytearray(path.read_bytes())
+    content[int(at * len(content))] ^= 1 << bit
+    path.write_bytes(content)
+
+
+def _host(run_dir: Path, step: int) -> Path:
+    """What the host knows beside the state, in a checkpoint."""
+    return run_dir / "checkpoints" / str(step) / "host" / "metadata"
+
+
+def test_a_flipped_bit_is_a_damaged_checkpoint(short_run, tmp_path, capsys):
+    """In the largest arrays, where it would change a number and nothing else; and in what the host knows."""
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    settings = dataclasses.replace(short_run, run_dir=str(folder))
+    files = (path for path in (folder / "checkpoints" / "120" / "state").rglob("*/0*") if path.is_file())
+    largest = sorted(files, key=lambda path: path.stat().st_size)[-3:]
+    for file, at in [*((file, at) for file in largest for at in (0.4, 0.8)), (_host(folder, 120), 0.5)]:
+        whole = file.read_bytes()
+        _flip(file, at)
+        assert evaluate.restore(settings)[1].step == 80, file
+        file.write_bytes(whole)
+    assert "the checkpoint at step 120 is damaged; taking the one before it" in capsys.readouterr().err
+    assert evaluate.restore(settings)[1].step == 120
+
+
+def test_a_checkpoint_from_before_it_knew_its_settings_is_read(short_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    for step in (80, 120):
+        host = json.loads(_host(folder, step).read_text())
+        _host(folder, step).write_text(json.dumps({name: host[name] for name in ("env", "seconds", "format")}))
+    assert training.train(dataclasses.replace(short_run, run_dir=str(folder), total_steps=160)) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"seed": 5}, r"its checkpoints were made with seed=0 \(not 5\); put config.yaml right, or give another"),
+        ({"algo": "mbpo", "temperature": 3.0}, r"made with algo=ops_mbpo \(not mbpo\), temperature="),
+        ({"model_hidden_size": 7}, r"made with model_hidden_size=\d+ \(not 7\);"),  # another shape is no damage
+        ({"total_steps": 80}, r"total_steps=80: the run has already done 120"),
+    ],
+)
+def test_settings_that_are_not_the_checkpoints_are_refused_and_nothing_changes(changes, expected, short_run, tmp_path):
+    """As an edited config.yaml has them, or a command where config.yaml is gone."""
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    (folder / "config.yaml").unlink()
+    before = _files(folder)
+    with pytest.raises(SettingError, match=expected):
+        training.train(dataclasses.replace(short_run, run_dir=str(folder), **changes))
+    assert _files(folder) == before
+    if changes == {"seed": 5}:
+        assert training.train(dataclasses.replace(short_run, run_dir=str(folder))) == 0  # the right ones
+        assert dataclasses.replace(config.load(folder), run_dir=short_run.run_dir) == short_run
+
+
+def test_a_run_whose_checkpoints_are_gone_does_not_begin_anew(short_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    shutil.rmtree(folder / "checkpoints")
+    before = _files(folder)
+    with pytest.raises(SettingError, match="its logs reach step 120, but its checkpoints are gone"):
+        training.train(dataclasses.replace(short_run, run_dir=str(folder)))
+    assert _files(folder) == before
+    assert not (folder / "checkpoints").exists()
+
+
+def test_what_is_wrong_with_the_logs_is_said_when_a_run_goes_on(short_run, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    metrics_file, episodes_file = folder / "metrics.jsonl", folder / "episodes.jsonl"
+    first, second, third = metrics_file.read_bytes().splitlines(keepends=True)
+    metrics_file.write_bytes(first + b"[1, 2]\n" + second[:20] + b"\n" + third)
+    episodes_file.write_bytes(episodes_file.read_bytes()[: episodes_file.stat().st_size // 2])
+    assert training.train(dataclasses.replace(short_run, run_dir=str(folder))) == 0
+    assert metrics_file.read_bytes() == first + third
+    said = capsys.readouterr().err
+    assert f"{metrics_file}: 2 line(s) that cannot be read, set aside in metrics.jsonl.strange" in said
+    assert "of its lines up to step 120 are lost" in said
+    assert said.count("\n") == 2
+
+
 def test_a_run_is_trained_by_one_process_at_a_time(short_run):
     with guards.alone_in(Path(short_run.run_dir)), pytest.raises(SettingError, match="another process is training"):
         training.train(short_run)
@@ -250,14 +337,14 @@ def test_a_run_goes_on_where_the_system_has_no_locks(tmp_path, monkeypatch):
 
 def test_a_disk_that_fills_up_stops_the_run_in_one_line(short_run, tmp_path, monkeypatch):
     """Not at the check before a save, but while a line is written; the checkpoint before it is whole."""
-    append = metrics._append
+    append = jsonl.Growing.append
 
-    def full(path, lines):
+    def full(file, lines):
         if any(line["env_steps"] > 60 for line in lines):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        append(path, lines)
+        append(file, lines)
 
-    monkeypatch.setattr(metrics, "_append", full)
+    monkeypatch.setattr(jsonl.Growing, "append", full)
     settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
     with pytest.raises(training.DiskError, match=r"cannot be written \(No space left on device\)"):
         training.train(settings)

@@ -1,7 +1,10 @@
 """The whole run on disk, through orbax: a resumed run is the run."""
 
+import json
 import logging
+import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,12 +14,14 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import type_handlers
 
+from vecpsmbpo import recorded
+from vecpsmbpo.algorithms import TABLE
 from vecpsmbpo.layout import Layout
-from vecpsmbpo.settings import SettingError
+from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.types import TrainState
 
 _log = logging.getLogger(__name__)
-FORMAT = 2  # of what is saved; a state that gains or loses fields is another one
+FOLDER = "checkpoints"  # in the run directory
 IN_FLIGHT_GB = 0.2  # being written or read at a time
 CHUNK_BYTES = 32 * 2**20  # of one file
 
@@ -34,11 +39,19 @@ class Checkpoints:
 
     Saving is atomic (orbax writes beside and renames) and synchronous: the next chunk is given these very buffers to
     overwrite. Rings are not copied to be saved: orbax is handed views of them, and writes few of them at a time.
+
+    A checkpoint holds the settings that it was made with, and checksums of all that it holds; older ones, which do not,
+    are read as they are.
     """
 
-    def __init__(self, directory: Path, *, keep: int | None = None, read_only: bool = False):
-        """`keep`: how many of the newest stay; None: all."""
-        self._directory = directory
+    def __init__(self, directory: Path, settings: Settings, *, keep: int | None = None, read_only: bool = False):
+        """
+        Args:
+            settings: that the run is gone on with, or read.
+            keep: how many of the newest stay; None: all.
+        """
+        self._directory, self._settings = directory, settings
+        self._format = TABLE[settings.algo].format
         self._damaged: list[int] = []
         for name in ("absl", "orbax"):
             logging.getLogger(name).setLevel(logging.ERROR)
@@ -73,7 +86,13 @@ class Checkpoints:
             self._manager.delete(self._damaged.pop())
         plain = _to_host(state, layout)
         chunks = jax.tree.map(lambda _: ocp.SaveArgs(chunk_byte_size=CHUNK_BYTES), plain)
-        host = {**host, "format": FORMAT}
+        about = {
+            "format": TABLE[self._settings.algo].format,
+            "settings": recorded.plain(self._settings),
+            "arrays": _arrays_sum(plain),
+        }
+        host = json.loads(json.dumps({**host, **about}))  # as it will be read
+        host["sum"] = _sum(host)
         items = ocp.args.Composite(state=ocp.args.PyTreeSave(plain, save_args=chunks), host=ocp.args.JsonSave(host))
         self._manager.save(step, args=items, force=True)
         self._manager.wait_until_finished()
@@ -90,7 +109,8 @@ class Checkpoints:
             at: only the checkpoint of this step.
 
         Raises:
-            SettingError: there are checkpoints, and none can be read, or an older version of this program wrote them.
+            SettingError: there are checkpoints, and none can be read; or they are of other settings, or of an older
+                version of this program.
         """
         reason: Exception | None = None
         for step in reversed(self.steps()):
@@ -115,15 +135,32 @@ class Checkpoints:
 
     def _read(self, step: int, shapes: TrainState, layout: Layout) -> Any:
         host = self._manager.restore(step, args=ocp.args.Composite(host=ocp.args.JsonRestore()))["host"]
-        if host.get("format") != FORMAT:
+        if host.pop("sum", None) not in (None, _sum(host)):
+            raise ValueError("its checksum is wrong")
+        if host.get("format") != self._format:
             raise SettingError(f"{self._directory}: is of another version of this program and cannot be gone on from")
+        recorded.check(self._settings, host.get("settings", {}))
         plain = _shapes_on_host(shapes, layout)
         as_array = jax.tree.map(lambda x: ocp.ArrayRestoreArgs(restore_type=np.ndarray), plain)
         state = ocp.args.PyTreeRestore(plain, restore_args=as_array)
-        return self._manager.restore(step, args=ocp.args.Composite(state=state, host=ocp.args.JsonRestore()))
+        found = self._manager.restore(step, args=ocp.args.Composite(state=state))["state"]
+        if host.get("arrays") not in (None, _arrays_sum(found)):
+            raise ValueError("a checksum of its arrays is wrong")
+        return {"state": found, "host": host}
 
     def close(self) -> None:
         self._manager.close()
+
+
+def _sum(host: dict[str, Any]) -> int:
+    return zlib.crc32(json.dumps(host, sort_keys=True).encode())
+
+
+def _arrays_sum(plain: dict[str, Any]) -> int:
+    """Of arrays on the host, in their order; a gigabyte a second and core."""
+    with ThreadPoolExecutor() as pool:
+        sums = pool.map(lambda x: zlib.crc32(np.ascontiguousarray(x).view(np.uint8)), jax.tree.leaves(plain))
+        return zlib.crc32(np.array(list(sums), np.uint32))
 
 
 # ── a train state as a checkpoint holds it: NumPy arrays, without padding, each ring by itself ────────────────────

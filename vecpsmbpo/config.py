@@ -16,7 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from vecpsmbpo import loggers
+from vecpsmbpo import loggers, recorded
 from vecpsmbpo.algorithms.catalogue import FIELDS, allowed, build, check, check_sweep, require
 from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import CHANGEABLE, SettingError, Settings
@@ -70,11 +70,15 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
         except HydraException as error:
             raise SettingError(f"{text}: is not a value that can be read ({_first_line(error)})") from None
         name = override.key_or_group
+        if override.is_delete():
+            raise SettingError(f"{text}: a setting cannot be taken away; give it another value")
         if sweep and name.startswith("hydra"):
             continue
         if override.is_sweep_override() and not sweep:
             raise SettingError(f"{text}: several values need -m")
         values = _sweep_values(override) if override.is_sweep_override() else [override.value()]
+        if len(set(map(str, values))) < len(values):
+            raise SettingError(f"{text}: the same value twice")
         for value in values:
             found[name] = _check_override(name, value)
             algorithms += [str(value)] if name == "algo" else []
@@ -193,12 +197,8 @@ def _default_run_dir(settings: Settings, overrides: Sequence[str]) -> str:
 
 def save(settings: Settings, run_dir: Path) -> None:
     """Writes `config.yaml`."""
-    values: dict[str, Any] = dataclasses.asdict(settings)
-    values["env_options"] = dict(settings.env_options)
-    values["sweep"] = {name: list(swept) for name, swept in settings.sweep}
-    values |= {name: list(value) for name, value in values.items() if isinstance(value, tuple)}
     beside = run_dir / f"{CONFIG_FILE}.tmp"
-    beside.write_text(yaml.safe_dump(values, sort_keys=False))
+    beside.write_text(yaml.safe_dump(recorded.plain(settings), sort_keys=False))
     beside.replace(run_dir / CONFIG_FILE)  # at once: a run whose config is cut short could not be resumed
 
 
@@ -254,7 +254,7 @@ def _resolved(overrides: Sequence[str], tree: DictConfig | None) -> Settings:
         had = dict(getattr(stored, _DOTTED[group])).get(option) if group else getattr(stored, name)
         if name == "run_dir" or value == had or (name, value) == ("backend", "auto"):
             continue
-        if name not in CHANGEABLE or (name == "total_steps" and getattr(stored, "real_ratio_schedule", "") == "linear"):
+        if not stored.may_change(name):
             raise SettingError(
                 f"{name}={value}: contradicts the run in {run_dir}, which has {name}={had}; "
                 "leave it out to resume, or give another run_dir"

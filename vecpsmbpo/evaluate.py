@@ -52,7 +52,7 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
     """The driver of a run and its newest checkpoint.
 
     Raises:
-        SettingError: the run holds no checkpoint, or there is not enough memory for it.
+        SettingError: the run holds no checkpoint, or none of these settings, or there is not enough memory for it.
     """
     with _opened(stored) as (driver, shapes, checkpoints):
         saved = checkpoints.restore(shapes, driver.layout, warn=_warn)
@@ -95,7 +95,7 @@ def _opened(stored: Settings) -> Iterator[tuple[Driver, TrainState, checkpoint.C
     driver = make_driver(stored)
     shapes = driver.shapes(*initial_inputs(stored))
     resources.check_memory(driver.algorithm, shapes)
-    checkpoints = checkpoint.Checkpoints(Path(stored.run_dir) / "checkpoints", read_only=True)
+    checkpoints = checkpoint.Checkpoints(Path(stored.run_dir) / checkpoint.FOLDER, stored, read_only=True)
     try:
         yield driver, shapes, checkpoints
     finally:

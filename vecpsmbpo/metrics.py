@@ -3,18 +3,17 @@
 And sessions.jsonl: a line for each time that somebody began, or went on with, the run.
 """
 
-import json
-import math
-import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
 import numpy as np
 
-from vecpsmbpo import mixture
+from vecpsmbpo import jsonl, mixture
+from vecpsmbpo.jsonl import Line
 from vecpsmbpo.loggers import Loggers
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.settings.parts import PosteriorSettings
@@ -23,35 +22,56 @@ from vecpsmbpo.types import EpisodeEnd, TrainState
 METRICS_FILE, EPISODES_FILE = "metrics.jsonl", "episodes.jsonl"
 SESSIONS_FILE = "sessions.jsonl"
 LEARNED = ("critic_loss", "actor_loss", "alpha", "q_mean", "entropy")  # in every line, null where nothing learns so
-Line = dict[str, Any]
+read = jsonl.read
 
 
 class RunLog:
     """The log files of one run directory."""
 
-    def __init__(self, run_dir: Path, env_steps: int, settings: Settings, warn: Callable[[str], None]):
-        """`warn`: is told what goes wrong with a logger.
+    def __init__(
+        self,
+        run_dir: Path,
+        env_steps: int,
+        settings: Settings,
+        warn: Callable[[str], None],
+        marks: Mapping[str, Any] = MappingProxyType({}),
+    ):
+        """Lines beyond `env_steps` belong to work that a kill undid and that will be done again: they are dropped.
 
-        Lines beyond `env_steps` belong to work that a kill undid and that will be done again: they are dropped."""
+        Args:
+            warn: is told what goes wrong with a logger, and what was found wrong in a file.
+            marks: what `marks` was at `env_steps`.
+        """
         self._run_dir, self._lane = run_dir, tuple(settings.lanes[0])
-        written = max(_rewind(run_dir / name, env_steps) for name in (METRICS_FILE, EPISODES_FILE))
+        needed = (jsonl.STEP, *self._lane)
+        self._files = {
+            name: jsonl.Growing(run_dir / name, env_steps, needed, marks.get(name), warn)
+            for name in (METRICS_FILE, EPISODES_FILE)
+        }
+        written = max(file.written for file in self._files.values())
+        self._sessions = jsonl.Growing(run_dir / SESSIONS_FILE, jsonl.LARGEST_STEP, (jsonl.STEP,), None, warn)
         self._loggers = Loggers(settings, run_dir, env_steps, written, warn)
+
+    @property
+    def marks(self) -> dict[str, list[int]]:
+        """By name of the file, what its lines are known by: for a checkpoint."""
+        return {name: list(file.mark) for name, file in self._files.items()}
 
     def session(self, line: Line) -> None:
         """Writes down that a session began, and what with."""
-        _append(self._run_dir / SESSIONS_FILE, [line])
+        self._sessions.append([line])
 
     def episodes(self, lines: Iterable[Line]) -> None:
         """Writes finished episodes."""
         lines = list(lines)
-        _append(self._run_dir / EPISODES_FILE, lines)
+        self._files[EPISODES_FILE].append(lines)
         for line in lines:
             self._scalars(line, ("return", "length"), "episode")
 
     def metrics(self, lines: Iterable[Line]) -> None:
         """Writes an epoch."""
         lines = list(lines)
-        _append(self._run_dir / METRICS_FILE, lines)
+        self._files[METRICS_FILE].append(lines)
         for line in lines:
             self._scalars(line, set(line) - {"env_steps", "seed"}, "epoch")
         self._loggers.flush()
@@ -63,46 +83,6 @@ class RunLog:
 
     def close(self) -> None:
         self._loggers.close()
-
-
-def read(path: Path) -> list[Line]:
-    """The lines of a JSONL file, without one that a kill cut short; none where there is no file."""
-    lines = []
-    if path.exists():
-        for text in path.read_text().splitlines():
-            try:
-                lines.append(json.loads(text))
-            except json.JSONDecodeError:
-                break
-    return lines
-
-
-def _append(path: Path, lines: list[Line]) -> None:
-    with path.open("a") as file:
-        file.write("".join(_json(line) for line in lines))
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _rewind(path: Path, env_steps: int) -> int:
-    """Drops lines beyond `env_steps`; the last step that there was a line of, or 0."""
-    lines = read(path)
-    kept = [line for line in lines if line["env_steps"] <= env_steps]
-    beside = path.with_suffix(".tmp")
-    beside.write_text("".join(_json(line) for line in kept))
-    beside.replace(path)
-    return max((line["env_steps"] for line in lines), default=0)
-
-
-def _json(line: Line) -> str:
-    """A line of a JSONL file. JSON has neither NaN nor infinity: they are null."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, list):
-            return [plain(item) for item in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps({name: plain(value) for name, value in line.items()}, allow_nan=False) + "\n"
 
 
 def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[Line]:

@@ -1,13 +1,13 @@
 """The memory that a run will take, before any of it is taken, and the memory that there is."""
 
 import errno
+import math
 import os
 import shutil
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from vecpsmbpo import replay
 from vecpsmbpo.algorithms.base import Algorithm
@@ -27,9 +27,9 @@ def state_bytes(layout: Layout, shapes: Any) -> int:
     total = 0
     for leaf, sharding in zip(jax.tree.leaves(shapes), jax.tree.leaves(layout.shardings(shapes)), strict=True):
         split = {axis for part in sharding.spec if part for axis in ((part,) if isinstance(part, str) else part)}
-        replicas = np.prod([layout.mesh.shape[axis] for axis in (SEEDS, MEMBERS) if axis not in split])
+        replicas = math.prod(layout.mesh.shape[axis] for axis in (SEEDS, MEMBERS) if axis not in split)
         size = 8 if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf.dtype.itemsize
-        total += int(np.prod(leaf.shape, dtype=np.int64)) * size * int(replicas)
+        total += math.prod(leaf.shape) * size * replicas
     return total
 
 

@@ -1,6 +1,7 @@
 """Every setting that some algorithm has, by name, and settings made of plain values."""
 
 import dataclasses
+import struct
 from collections.abc import Mapping
 from typing import Any
 
@@ -57,7 +58,10 @@ def check_sweep(name: str, values: Any) -> tuple[float, ...]:
         raise SettingError(f"sweep.{name}: cannot be swept in one program (-m can); one of {traced}")
     if not isinstance(values, list | tuple) or not values:
         raise SettingError(f"sweep.{name}={values}: must be a list of values, each {allowed(name)}")
-    return tuple(check(name, value) for value in values)
+    checked = tuple(check(name, value) for value in values)
+    if len({struct.pack("f", value) for value in checked}) < len(checked):
+        raise SettingError(f"sweep.{name}={list(values)}: two of its values are the same in float32")
+    return checked
 
 
 def build(values: Mapping[str, Any]) -> Settings:

@@ -4,22 +4,18 @@ Logs are read as columns, a batch of lines at a time: time and memory grow with 
 episodes are some arrays and not a million dictionaries.
 """
 
-import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vecpsmbpo import config
+from vecpsmbpo import config, jsonl
 from vecpsmbpo.settings import SettingError, Settings
 
 METRICS_FILE, EPISODES_FILE = "metrics.jsonl", "episodes.jsonl"
-INFINITY = "inf"  # in a swept value: JSON has no other
-BATCH = 20_000  # lines that are parsed at a time
 
 Array = np.ndarray
 Columns = dict[str, Array]
@@ -170,43 +166,15 @@ def read(path: Path, needed: Iterable[str] = ("env_steps", "seed")) -> Log:
     """A JSONL file as columns; empty where there is no file. Lines without the `needed` numbers count as damaged."""
     if not path.exists():
         return Log({}, 0)
-    needed, damaged = tuple(needed), 0
+    damaged = 0
     parts: list[Columns] = []
     with path.open("rb") as file:
-        while batch := list(islice(file, BATCH)):
-            lines, lost = _parse(batch, needed)
-            # A last line without its end is being written, or was when the machine went down.
-            damaged += lost - (lost > 0 and not batch[-1].endswith(b"\n") and not _dictionary(batch[-1], needed))
+        for _, found in jsonl.batches(file, needed):
+            lines = [line for line in found if line is not None]
+            damaged += len(found) - len(lines)
             if lines:
                 parts.append(_columns(lines))
     return Log(_concatenate(parts), damaged)
-
-
-def _parse(batch: list[bytes], needed: tuple[str, ...]) -> tuple[list[dict[str, Any]], int]:
-    """The batch's dictionaries, and how many of its lines hold none."""
-    try:
-        lines = json.loads(b"[" + b",".join(batch) + b"]")  # at once: twice as fast as line by line
-        if len(lines) == len(batch) and all(_has(line, needed) for line in lines):
-            return lines, 0
-    except (ValueError, RecursionError):
-        pass
-    found = [_dictionary(line, needed) for line in batch if line.strip()]
-    return [line for line in found if line], sum(line is None for line in found)
-
-
-def _dictionary(line: bytes, needed: tuple[str, ...]) -> dict[str, Any] | None:
-    try:
-        found = json.loads(line)
-    except (ValueError, RecursionError):  # ValueError: also bytes that are no UTF-8
-        return None
-    return found if _has(found, needed) else None
-
-
-def _has(line: Any, needed: tuple[str, ...]) -> bool:
-    """Whether a line is a dictionary with these numbers."""
-    return isinstance(line, dict) and all(
-        type(line.get(name)) in (int, float) or line.get(name) == INFINITY for name in needed
-    )
 
 
 def _columns(lines: list[dict[str, Any]]) -> Columns:
@@ -220,7 +188,7 @@ def _column(values: list[Any]) -> Array | None:
     column: Array | None
     try:
         column = np.array(values, float)  # None becomes NaN, "inf" infinity
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         column = _with_gaps(values)
     # Lists are probabilities of members, most of a log, and float32 themselves.
     return column if column is None or column.ndim < 2 else column.reshape(len(column), -1).astype(np.float32)
@@ -234,7 +202,7 @@ def _with_gaps(values: list[Any]) -> Array | None:
     try:
         nothing = np.full(np.shape(like), np.nan)
         return np.array([nothing if value is None else value for value in values], float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
 
 

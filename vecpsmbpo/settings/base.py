@@ -12,6 +12,14 @@ from vecpsmbpo.settings.fields import choice, is_traced, real, whole
 Options = tuple[tuple[str, Any], ...]  # name and value of each `env.*` option, in the order of names
 Sweep = tuple[tuple[str, tuple[float, ...]], ...]  # name and values of each `sweep.*`, in the order of names
 
+# Settings that a resumed run may change: they steer the loop around the run, not what it computes.
+CHANGEABLE = frozenset(
+    {"total_steps", "eval_episodes", "eval_policy", "eval_actions", "checkpoint_every", "report", "devices"}
+    | {"keep_checkpoints", "loggers", "compile_cache"}
+)
+
+MOST_LANES = 10_000
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -24,7 +32,7 @@ class Settings:
     size: str
     recipe: str
     backend: str = choice("auto", "mjx", "host")
-    seed: int = whole(0, 2**31 - 1)
+    seed: int = whole(0)
     num_seeds: int = whole(1)
     sweep: Sweep = ()
     total_steps: int = whole(1)
@@ -127,6 +135,10 @@ class Settings:
         """k, when one row in k validates: the split draws one row of every k consecutive ones."""
         return round(1 / self.validation_ratio)
 
+    def may_change(self, name: str) -> bool:
+        """Whether a resumed run may be given another value of the setting `name`."""
+        return name in CHANGEABLE
+
     def contradictions(self) -> Iterator[tuple[bool, str]]:
         """Whether settings contradict one another, and how to say so; a subclass adds its own."""
         yield (
@@ -141,6 +153,11 @@ class Settings:
             self.seed + self.num_seeds > 2**31,
             f"num_seeds={self.num_seeds}: the last seed, seed + num_seeds - 1, must be at most {2**31 - 1}",
         )
+        lanes = self.num_seeds * math.prod(len(values) for _, values in self.sweep)
+        yield (
+            lanes > MOST_LANES,
+            f"num_seeds={self.num_seeds}: at most {MOST_LANES} seeds, each swept value counted, not {lanes}",
+        )
         yield (
             not math.isclose(self.validation_block * self.validation_ratio, 1, rel_tol=1e-2),
             f"validation_ratio={self.validation_ratio}: must be 1 / k for a whole number k, as one row in k validates",
@@ -153,10 +170,3 @@ class Settings:
             self.replay_capacity < self.warmup_steps,
             f"replay_capacity={self.replay_capacity}: must be at least warmup_steps",
         )
-
-
-# Settings that a resumed run may change: they steer the loop around the run, not what it computes.
-CHANGEABLE = frozenset(
-    {"total_steps", "eval_episodes", "eval_policy", "eval_actions", "checkpoint_every", "report", "devices"}
-    | {"keep_checkpoints", "loggers", "compile_cache"}
-)

@@ -6,12 +6,16 @@ from typing import Any
 
 Range = tuple[float | None, float | None]
 
+# What the program's int32 and float32 hold; smaller numbers are taken for 0.
+LARGEST_WHOLE = 2**31 - 1
+LARGEST, SMALLEST = 3.4e38, 1.2e-38
+
 
 class SettingError(Exception):
     """A mistake in a setting: one line that names the setting and what it may be."""
 
 
-def whole(at_least: int, at_most: int | None = None) -> Any:
+def whole(at_least: int, at_most: int = LARGEST_WHOLE) -> Any:
     """A setting that is a whole number."""
     return dataclasses.field(metadata={"range": (at_least, at_most)})
 
@@ -46,7 +50,7 @@ def allowed(field: Any) -> str:
     kind = kinds[field.type]
     low, high = field.metadata.get("range", (None, None))
     above = "above" if field.metadata.get("open_low") else "at least"
-    if low is not None and high is not None:
+    if low is not None and high not in (None, LARGEST_WHOLE):
         return f"{kind} from {low} to {high}" if above == "at least" else f"{kind} above {low} and at most {high}"
     return kind if low is None else f"{kind}, {above} {low}"
 
@@ -93,6 +97,10 @@ def _number(field: Any, value: Any, complaint: SettingError) -> Any:
         raise complaint
     low, high = field.metadata.get("range", (None, None))
     too_low = low is not None and (number < low or (number == low and field.metadata.get("open_low", False)))
+    if field.type is int and number > LARGEST_WHOLE:
+        raise SettingError(f"{field.name}={value}: must be at most {LARGEST_WHOLE}")
     if too_low or (high is not None and number > high):
         raise complaint
+    if field.type is not int and number and not SMALLEST <= abs(number) <= LARGEST and math.isfinite(number):
+        raise SettingError(f"{field.name}={value}: must be 0 or between {SMALLEST} and {LARGEST} in size")
     return number

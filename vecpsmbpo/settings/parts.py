@@ -78,6 +78,10 @@ class PosteriorSettings(Settings):
     def weighs_values(self) -> bool:
         return self.weights == "values"
 
+    def may_change(self, name: str) -> bool:
+        falls = self.real_ratio_schedule == "linear"  # over the whole run
+        return super().may_change(name) and not (falls and name == "total_steps")
+
     @property
     def imagines(self) -> bool:
         """Whether any lane ever learns from imagined data (λ < 1)."""

@@ -9,11 +9,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from vecpsmbpo import checkpoint, config, crash, health, metrics, resources, runtime, versions
+from vecpsmbpo import checkpoint, config, crash, health, jsonl, metrics, resources, runtime, versions
 from vecpsmbpo.drivers import Driver, Returns
 from vecpsmbpo.look import report
 from vecpsmbpo.progress import Display, Rates, Stopwatch
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.training.guards import Stop, alone_in, disk_errors, heeding_signals
 from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.types import TrainState
@@ -29,7 +29,8 @@ def train(settings: Settings) -> int:
         0, 1 where a lane is frozen (`health`), or 128 + the number of the signal that stopped it.
 
     Raises:
-        SettingError: it cannot be run as asked (`resources.check_memory`, `envs.make`).
+        SettingError: it cannot be run as asked (`resources.check_memory`, `envs.make`), or not be gone on with. Nothing
+            has been changed then.
         DiskError: the run directory cannot be written.
     """
     runtime.configure(settings)
@@ -40,7 +41,7 @@ def train(settings: Settings) -> int:
     with disk_errors(run_dir):
         run_dir.mkdir(parents=True, exist_ok=True)
         with alone_in(run_dir), heeding_signals() as stop:
-            config.save(settings, run_dir)
+            _check_not_emptied(run_dir)
             crash.doing("making the first state", run_dir)
             return _Session(settings, driver, shapes, memory).go(stop)
 
@@ -51,8 +52,12 @@ class _Session:
     def __init__(self, settings: Settings, driver: Driver, shapes: TrainState, memory: str):
         self.settings, self.driver = settings, driver
         self.run_dir = Path(settings.run_dir)
-        self.checkpoints = checkpoint.Checkpoints(self.run_dir / "checkpoints", keep=settings.keep_checkpoints)
+        keep = settings.keep_checkpoints
+        self.checkpoints = checkpoint.Checkpoints(self.run_dir / checkpoint.FOLDER, settings, keep=keep)
         saved = self.checkpoints.restore(shapes, driver.layout, warn=_warn)
+        if saved and saved.step > settings.total_steps:
+            raise SettingError(f"total_steps={settings.total_steps}: the run has already done {saved.step}")
+        config.save(settings, self.run_dir)  # now that it is known to be the run's own
         self.state = saved.state if saved else driver.init(*initial_inputs(settings))
         self.saved_step = saved.step if saved else None
         self.watch = Stopwatch(saved.host["seconds"] if saved else 0.0)
@@ -60,7 +65,8 @@ class _Session:
             driver.load_env(saved.host["env"])
         self.env_steps = saved.step if saved else 0
         self.frozen = np.asarray(health.frozen(self.state.seeds.health))
-        self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn)
+        marks = saved.host.get("logs", {}) if saved else {}
+        self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn, marks)
         self.display = Display(driver.algorithm, self.env_steps)
         self.memory = memory
         self.epoch_began = time.perf_counter()
@@ -234,7 +240,7 @@ class _Session:
     def _save(self) -> None:
         if self.saved_step != self.env_steps:
             resources.check_disk(self.run_dir, self.state, self.env_steps, self.driver.layout)
-            host = {"env": self.driver.save_env(), "seconds": self.watch()}
+            host = {"env": self.driver.save_env(), "seconds": self.watch(), "logs": self.log.marks}
             self.checkpoints.save(self.env_steps, self.state, host, self.driver.layout)
             self.saved_step = self.env_steps
 
@@ -248,6 +254,20 @@ class _Session:
             return 128 + (stop.requested or 0)
         self.display.say(f"to evaluate: vecpsmbpo eval {shlex.quote(f'run_dir={self.run_dir}')} episodes=10")
         return self._status
+
+
+def _check_not_emptied(run_dir: Path) -> None:
+    """Raises:
+    SettingError: there are logs of a run, and no checkpoints: beginning anew would write over them.
+    """
+    if not any(path.name.isdecimal() for path in (run_dir / checkpoint.FOLDER).glob("*")):
+        files = (metrics.METRICS_FILE, metrics.EPISODES_FILE)
+        done = max((line[jsonl.STEP] for name in files for line in metrics.read(run_dir / name)), default=0)
+        if done:
+            raise SettingError(
+                f"run_dir={run_dir}: its logs reach step {done}, but its checkpoints are gone; put them back, or give "
+                "another run_dir"
+            )
 
 
 def _warn(text: str) -> None:

@@ -1,0 +1,39 @@
+"""Settings as a run keeps them, in `config.yaml` and in every checkpoint: what was, against what is asked for now."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from vecpsmbpo.settings import SettingError, Settings
+
+SHOWN = 6  # contradictions that a line names
+
+
+def plain(settings: Settings) -> dict[str, Any]:
+    """Value by name, in the types of JSON and YAML."""
+    values = dataclasses.asdict(settings)
+    values["env_options"] = dict(settings.env_options)
+    values["sweep"] = {name: list(swept) for name, swept in settings.sweep}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+
+def check(settings: Settings, record: Mapping[str, Any]) -> None:
+    """That a checkpoint was made with these settings, where both know them.
+
+    Args:
+        record: what `plain` gave when it was made.
+
+    Raises:
+        SettingError: some differ that may not.
+    """
+    wrong = [
+        f"{name}={record[name]} (not {value})"
+        for name, value in plain(settings).items()
+        if name != "run_dir" and not settings.may_change(name) and record.get(name, value) != value
+    ]
+    if wrong:
+        more = [f"{len(wrong) - SHOWN} more"] if len(wrong) > SHOWN else []
+        raise SettingError(
+            f"run_dir={settings.run_dir}: its checkpoints were made with {', '.join(wrong[:SHOWN] + more)}; "
+            "put config.yaml right, or give another run_dir"
+        )
