@@ -1,5 +1,6 @@
 """The whole run on disk, through orbax: a resumed run is the run."""
 
+import errno
 import json
 import logging
 import zlib
@@ -22,6 +23,7 @@ from vecpsmbpo.types import TrainState
 _log = logging.getLogger(__name__)
 FOLDER = "checkpoints"  # in the run directory
 FORMAT = 2  # of what is saved; a state that gains or loses fields is another one
+SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # of the system, and no damage
 IN_FLIGHT_GB = 0.2  # being written or read at a time
 CHUNK_BYTES = 32 * 2**20  # of one file
 
@@ -54,6 +56,7 @@ class Checkpoints:
         self._damaged: list[int] = []
         for name in ("absl", "orbax"):
             logging.getLogger(name).setLevel(logging.ERROR)
+        logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # of every file that cannot be read, beside the error
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep,
             enable_async_checkpointing=False,
@@ -116,6 +119,8 @@ class Checkpoints:
             except (MemoryError, SettingError):
                 raise
             except Exception as error:  # whatever a damaged file makes orbax raise
+                if isinstance(error, OSError) and error.errno in SHORTAGES:
+                    raise
                 _log.debug("checkpoint %d", step, exc_info=error)
                 warn(f"the checkpoint at step {step} is damaged; taking the one before it")
                 reason = error
