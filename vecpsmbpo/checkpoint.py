@@ -159,8 +159,8 @@ def _sum(host: dict[str, Any]) -> int:
 def _arrays_sum(plain: dict[str, Any]) -> int:
     """Of arrays on the host, in their order; a gigabyte a second and core."""
     with ThreadPoolExecutor() as pool:
-        sums = pool.map(lambda x: zlib.crc32(np.ascontiguousarray(x).view(np.uint8)), jax.tree.leaves(plain))
-        return zlib.crc32(np.array(list(sums), np.uint32))
+        sums = pool.map(lambda x: zlib.crc32(np.ascontiguousarray(x).data), jax.tree.leaves(plain))
+        return zlib.crc32(np.array(list(sums), np.uint32).data)
 
 
 # ── a train state as a checkpoint holds it: NumPy arrays, without padding, each ring by itself ────────────────────

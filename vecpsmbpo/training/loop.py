@@ -17,7 +17,7 @@ from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.training.guards import Stop, alone_in, disk_errors, heeding_signals
 from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
-from vecpsmbpo.types import TrainState
+from vecpsmbpo.types import EpisodeEnd, TrainState
 
 # An epoch that takes longer than this is run in chunks of about half of it, to show progress and to heed signals.
 LONG_EPOCH_S = 20.0
@@ -140,6 +140,7 @@ class _Session:
             self.epoch_began, self.epoch_steps_done = time.perf_counter(), 0
         strides = self._strides(settings.epoch_steps - into_epoch)
         began = time.perf_counter()
+        news: EpisodeEnd | None
         failed: Interrupted | None = None
         try:
             self.state, news = self.driver.run(self.state, strides)
