@@ -25,4 +25,6 @@ def load(path: str) -> Any:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise SettingError(f"env.make={path}: {error}") from None
+    if not callable(found):
+        raise SettingError(f"env.make={path}: is {found!r}, which makes nothing when it is called"[:300])
     return found()

@@ -5,6 +5,7 @@ import importlib.util
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from vecpsmbpo import words
 from vecpsmbpo.settings import SettingError
 
 
@@ -104,13 +105,19 @@ def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0, 
         options: which task of a suite, as `env.*` on the command line: `make("gymnasium", id="Swimmer-v5")`.
 
     Raises:
-        SettingError: no such task or backend, its suite is not installed, or it cannot be learned (images, discrete
-            actions).
+        SettingError: no such task or backend, its suite is not installed, it cannot be learned (images, discrete
+            actions), or whatever its own code raises.
     """
     backend = resolve_backend(name, backend)
     task = TASKS[name]
     if not task.installed:
         raise SettingError(f"env={name}: needs the package {task.suite}; pip install {task.needs or task.suite}")
     module, attribute = task.code[backend].split(":")
-    found = getattr(importlib.import_module(f"vecpsmbpo.envs.{backend}.{module}"), attribute)
-    return found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **options)
+    try:
+        found = getattr(importlib.import_module(f"vecpsmbpo.envs.{backend}.{module}"), attribute)
+        return found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **options)
+    except SettingError:
+        raise
+    except (Exception, SystemExit) as error:
+        which = " ".join([f"env={name}", *(f"env.{option}={value}" for option, value in options.items())])
+        raise SettingError(f"{which}: cannot be made ({words.of(error)})") from error

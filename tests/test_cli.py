@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
+import re
 import subprocess
 import sys
 
@@ -73,6 +74,8 @@ MISTAKES = [
     (["theory", "episodes=many"], "episodes=many: must be"),
     (["envs", "x"], "x: envs takes no arguments"),
     (["trian"], "trian: no such command"),
+    (["train", "-m", "hydra.nosuch=3", "seed=0,1"], "Could not override 'hydra.nosuch'"),
+    (["train", "-m", "hydra/launcher=nosuch", "seed=0,1"], "In 'hydra/config': Could not find 'hydra/launcher/nosuch'"),
 ]
 
 WITHOUT_JAX = """
@@ -257,11 +260,22 @@ def test_a_run_from_before_a_setting_existed_is_read_with_its_default(tmp_path):
     assert config.load(tmp_path) == settings
 
 
-@pytest.mark.parametrize("text", [json.dumps({"env": "hopper"}), "", "[1, 2]", "{"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(json.dumps({"env": "hopper"}), "", "[1, 2]", "{", "5", "\xff\x00", "[" * 5000, "{[1]: 2}", "- a\n b: c"),
+        *("env: [1]", "sweep: 5", "env_options: 5", "env_options: [[1], 2]", "algo: foo", "env: {}", "seed: -1"),
+    ],
+)
 def test_a_damaged_config_is_named(tmp_path, text):
-    (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(SettingError, match=r"its config\.yaml cannot be read"):
+    config.save(config.compose(["size=tiny"]), tmp_path)
+    good = (tmp_path / "config.yaml").read_text()
+    named = text.partition(":")[0]
+    damaged = re.sub(rf"^{named}:.*\n", f"{text}\n", good, flags=re.M) if f"\n{named}:" in f"\n{good}" else text
+    (tmp_path / "config.yaml").write_bytes(damaged.encode("latin-1"))
+    with pytest.raises(SettingError, match=r"its config\.yaml (cannot be read|has )") as error:
         config.load(tmp_path)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("experiment", config.options("experiment"))

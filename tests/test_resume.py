@@ -18,6 +18,7 @@ import pytest
 import vecpsmbpo
 from tests.helpers import argv, assert_probabilities_follow, check_log, command, environment, tiny
 from vecpsmbpo import config, evaluate, jsonl, metrics, recorded, training
+from vecpsmbpo.envs.host.dm_control import DmControlSimulator
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.training import guards
 
@@ -322,6 +323,32 @@ def test_what_is_wrong_with_the_logs_is_said_when_a_run_goes_on(short_run, tmp_p
     assert f"{metrics_file}: 2 line(s) that cannot be read, set aside in metrics.jsonl.strange" in said
     assert "of its lines up to step 120 are lost" in said
     assert said.count("\n") == 2
+
+
+def test_a_simulator_that_fails_costs_its_stride_and_no_more(short_run, tmp_path, monkeypatch, capsys):
+    """One line, the state before the stride is saved, and the mended task goes on to the same end."""
+    settings, step = dataclasses.replace(short_run, run_dir=str(tmp_path / "a b=c")), DmControlSimulator.step
+    left = [66]  # steps, those of an evaluation included
+
+    def breaks(self, action):
+        left[0] -= 1
+        if left[0] < 0:
+            raise SystemExit(0)  # what would end the program as if all were well
+        return step(self, action)
+
+    monkeypatch.setattr(DmControlSimulator, "step", breaks)
+    assert training.train(settings) == 1
+    monkeypatch.undo()
+    said = capsys.readouterr()
+    saved = evaluate.restore(settings)[1].step
+    assert 0 < saved < 66
+    assert re.search(rf"ball_in_cup failed at step \d+: SystemExit: 0 at .*; saved at step {saved}; to cont", said.err)
+    assert said.err.rstrip().endswith(
+        """to continue: vecpsmbpo train 'run_dir='"'"'""" + str(tmp_path) + """/a b=c'"'"''"""
+    )
+    assert "Traceback" not in said.out + said.err
+    assert training.train(settings) == 0
+    assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(short_run):

@@ -1,5 +1,6 @@
 """The whole run on disk, through orbax: a resumed run is the run."""
 
+import errno
 import json
 import logging
 import zlib
@@ -22,6 +23,7 @@ from vecpsmbpo.types import TrainState
 
 _log = logging.getLogger(__name__)
 FOLDER = "checkpoints"  # in the run directory
+SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # of the system, and no damage
 IN_FLIGHT_GB = 0.2  # being written or read at a time
 CHUNK_BYTES = 32 * 2**20  # of one file
 
@@ -55,6 +57,7 @@ class Checkpoints:
         self._damaged: list[int] = []
         for name in ("absl", "orbax"):
             logging.getLogger(name).setLevel(logging.ERROR)
+        logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # of every file that cannot be read, beside the error
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep,
             enable_async_checkpointing=False,
@@ -121,6 +124,8 @@ class Checkpoints:
             except (MemoryError, SettingError):
                 raise
             except Exception as error:  # whatever a damaged file makes orbax raise
+                if isinstance(error, OSError) and error.errno in SHORTAGES:
+                    raise
                 _log.debug("checkpoint %d", step, exc_info=error)
                 warn(f"the checkpoint at step {step} is damaged; taking the one before it")
                 reason = error
@@ -159,8 +164,8 @@ def _sum(host: dict[str, Any]) -> int:
 def _arrays_sum(plain: dict[str, Any]) -> int:
     """Of arrays on the host, in their order; a gigabyte a second and core."""
     with ThreadPoolExecutor() as pool:
-        sums = pool.map(lambda x: zlib.crc32(np.ascontiguousarray(x).view(np.uint8)), jax.tree.leaves(plain))
-        return zlib.crc32(np.array(list(sums), np.uint32))
+        sums = pool.map(lambda x: zlib.crc32(np.ascontiguousarray(x).data), jax.tree.leaves(plain))
+        return zlib.crc32(np.array(list(sums), np.uint32).data)
 
 
 # ── a train state as a checkpoint holds it: NumPy arrays, without padding, each ring by itself ────────────────────

@@ -1,9 +1,15 @@
 """The command line. Imports JAX only once every argument has been understood."""
 
+import contextlib
 import importlib
+import io
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from vecpsmbpo import crash
 from vecpsmbpo.settings import SettingError, Settings
@@ -40,12 +46,20 @@ LOOKS = ("plot", "compare", "report", "figure", "render", "export", "diagnose")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs a command line; the exit status. A user's mistake is one line on stderr and status 2."""
+    """Runs a command line; the exit status. A user's mistake is one line on stderr and status 2, and so is what the
+    system does not let it do."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? for one
     try:
         return _dispatch(arguments)
     except SettingError as error:
         print(f"vecpsmbpo: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"vecpsmbpo: {where}{error.strerror or error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:  # before a run heeds signals itself, or a second one
         print("vecpsmbpo: interrupted", file=sys.stderr)
@@ -90,9 +104,32 @@ def _train(overrides: list[str]) -> int:
     return _run(config.resolve(overrides))
 
 
-def _run(settings: Settings) -> int:
-    from vecpsmbpo.training import DiskError, train
+@contextlib.contextmanager
+def _nothing_to_save() -> Iterator[None]:
+    """While JAX is imported: Ctrl-C ends the process at once. As an exception it can be lost in a module that is being
+    imported, which catches everything."""
 
+    def leave(number: int, frame: Any) -> None:
+        print("vecpsmbpo: interrupted", file=sys.stderr, flush=True)
+        crash.end()
+        os._exit(130)
+
+    if "jax" in sys.modules or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _run(settings: Settings) -> int:
+    with _nothing_to_save():
+        from vecpsmbpo import runtime
+        from vecpsmbpo.training import DiskError, train
+
+        runtime.check_flags()
     try:
         return train(settings)
     except DiskError as error:
@@ -130,8 +167,11 @@ def _multirun(overrides: list[str]) -> int:
             sys.exit(status)
         worst = max(worst, status)
 
-    sys.argv = ["vecpsmbpo", *config.for_hydra(overrides), "hydra.mode=MULTIRUN"]
-    hydra.main(version_base="1.3", config_path="pkg://vecpsmbpo.configs", config_name="config")(task)()
+    sys.argv = ["vecpsmbpo", "--multirun", *config.for_hydra(overrides)]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves its errors to us
+    with config.hydra_errors(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r"\s*Running Hydra app with --multirun")
+        hydra.main(version_base="1.3", config_path="pkg://vecpsmbpo.configs", config_name="config")(task)()
     return worst
 
 
@@ -139,8 +179,11 @@ def _eval(rest: list[str]) -> int:
     from vecpsmbpo import config
 
     stored, settings = config.parse_evaluation(rest)
-    from vecpsmbpo.evaluate import show
+    with _nothing_to_save():
+        from vecpsmbpo import runtime
+        from vecpsmbpo.evaluate import show
 
+        runtime.check_flags()
     return show(stored, settings)
 
 

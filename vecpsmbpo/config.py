@@ -1,9 +1,11 @@
 """From a command line to `Settings`: Hydra composes, and every mistake becomes one line."""
 
+import contextlib
 import dataclasses
 import difflib
+import hashlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import CHANGEABLE, SettingError, Settings
 
 CONFIG_FILE = "config.yaml"
+LONGEST_NAME = 200  # of a default run directory, in bytes; file systems take 255
 GROUPS = ("env", "algo", "size", "recipe")
 _DOTTED = {"env": "env_options", "sweep": "sweep"}  # where the settings `env.*` and `sweep.*` are kept
 # What the name of a default run directory already says, or need not say.
@@ -141,7 +144,7 @@ def _check_override(name: str, value: Any) -> Any:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0]
+    return (str(error).strip() or repr(error)).splitlines()[0]
 
 
 def compose(overrides: Sequence[str]) -> Settings:
@@ -152,12 +155,18 @@ def compose(overrides: Sequence[str]) -> Settings:
     """
     given = parse(overrides)
     _check_algorithm(given.get("algo", _default("algo")), given)
+    with hydra_errors(), hydra.initialize_config_module("vecpsmbpo.configs", version_base="1.3"):
+        tree = hydra.compose("config", for_hydra(overrides))
+    return from_tree(tree, overrides)
+
+
+@contextlib.contextmanager
+def hydra_errors() -> Iterator[None]:
+    """Turns what Hydra complains of into one line."""
     try:
-        with hydra.initialize_config_module("vecpsmbpo.configs", version_base="1.3"):
-            tree = hydra.compose("config", for_hydra(overrides))
+        yield
     except (HydraException, OmegaConfBaseException) as error:
         raise SettingError(_first_line(error)) from None
-    return from_tree(tree, overrides)
 
 
 def for_hydra(overrides: Iterable[str]) -> list[str]:
@@ -167,7 +176,8 @@ def for_hydra(overrides: Iterable[str]) -> list[str]:
 
 def from_tree(tree: DictConfig, overrides: Sequence[str]) -> Settings:
     """Settings from what Hydra composed, with the backend and the run directory resolved."""
-    values: Any = OmegaConf.to_container(tree, resolve=True)
+    with hydra_errors():
+        values: Any = OmegaConf.to_container(tree, resolve=True)
     values["sweep"] = values["sweep"] or {}
     values["env_options"] = {name: value for name, value in values["env"].items() if name != "name"}
     for group in GROUPS:
@@ -191,8 +201,10 @@ def _default_run_dir(settings: Settings, overrides: Sequence[str]) -> str:
     experiment = [text.removeprefix("experiment=") for text in extra if text.startswith("experiment=")]
     parts = [settings.env, *task, settings.algo, settings.size, f"seed{settings.seed}", *others]
     # Only what the command line reads back without quotes.
-    parts = [re.sub(r"[^\w.+-]", "_", part.replace("=", "")) for part in parts]
-    return str(Path("runs", *experiment) / "-".join(parts))
+    name = "-".join(re.sub(r"[^\w.+-]", "_", part.replace("=", "")) for part in parts)
+    if len(name.encode()) > LONGEST_NAME:
+        name = f"{name[: LONGEST_NAME // 4]}-{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+    return str(Path("runs", *experiment) / name)
 
 
 def save(settings: Settings, run_dir: Path) -> None:
@@ -213,10 +225,14 @@ def load(run_dir: str | Path) -> Settings:
         stored = yaml.safe_load(path.read_text())
         # What the run does not know came to this program after it, and is off by default.
         values = {**_defaults(stored["algo"]), "recipe": "paper", **stored}
+        for group in ("env", "algo"):
+            _check_override(group, values[group])
         return dataclasses.replace(build(values), run_dir=str(run_dir))
     except OSError:
         raise SettingError(f"run_dir={run_dir}: holds no {CONFIG_FILE}, so no run") from None
-    except (KeyError, TypeError, yaml.YAMLError) as error:
+    except SettingError as error:
+        raise SettingError(f"run_dir={run_dir}: its {CONFIG_FILE} has {error}") from None
+    except (LookupError, TypeError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise SettingError(f"run_dir={run_dir}: its {CONFIG_FILE} cannot be read ({_first_line(error)})") from None
 
 
@@ -241,9 +257,14 @@ def _resolved(overrides: Sequence[str], tree: DictConfig | None) -> Settings:
     def new() -> Settings:
         return compose(overrides) if tree is None else from_tree(tree, overrides)
 
-    run_dir = given.get("run_dir") or new().run_dir
-    if not (Path(run_dir) / CONFIG_FILE).exists():
-        return new()
+    run_dir = given.get("run_dir") or ""
+    if not run_dir or "${" in run_dir:
+        run_dir = new().run_dir
+    try:
+        if not (Path(run_dir) / CONFIG_FILE).exists():
+            return new()
+    except (OSError, ValueError) as error:  # a name too long, or with a null byte
+        raise SettingError(f"run_dir={run_dir}: {getattr(error, 'strerror', None) or error}") from None
     stored = load(run_dir)
     _check_algorithm(stored.algo, given)
     changed: dict[str, Any] = {}
@@ -327,12 +348,17 @@ def overrides_of(settings: Mapping[str, Any]) -> list[str]:
     found = []
     for name, value in settings.items():
         if name not in dots:
-            found.append(f"{name}={_written(name, value)}")
+            found.append(as_override(name, value))
         elif not isinstance(value, Mapping):
             raise SettingError(f"{name}={value}: must be a dictionary")
         else:
             found += [f"{dots[name]}{inner}={_written(inner, item)}" for inner, item in value.items()]
     return found
+
+
+def as_override(name: str, value: Any) -> str:
+    """`name=value` as Hydra reads it back."""
+    return f"{name}={_written(name, value)}"
 
 
 def _written(name: str, value: Any) -> str:

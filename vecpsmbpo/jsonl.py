@@ -17,22 +17,16 @@ BATCH = 20_000  # lines that are parsed at a time
 LARGEST_STEP = 2**53  # a whole number that a float holds, too
 
 
-def batches(file: BinaryIO, needed: Iterable[str] = (STEP,)) -> Iterator[tuple[list[bytes], list[Line | None]]]:
-    """The lines of an open file, a batch at a time: as they stand there, and what they say.
+def batches(file: BinaryIO, needed: Iterable[str] = (STEP,)) -> Iterator[list[tuple[bytes, Line | None]]]:
+    """The lines of an open file, a batch at a time: each as it stands there, and what it says.
 
     None is a line that is strange: no dictionary, or one without the `needed` numbers. Empty lines are passed over, and
     so is a last one without its end that cannot be read: it is being written, or was when the machine went down.
     """
     needed = tuple(needed)
     while texts := list(islice(file, BATCH)):
-        lines = _parse(texts, needed)
-        there = [
-            bool(text.strip()) and (line is not None or text.endswith(b"\n"))
-            for text, line in zip(texts, lines, strict=True)
-        ]
-        if not all(there):
-            texts, lines = ([item for item, it in zip(items, there, strict=True) if it] for items in (texts, lines))
-        yield texts, lines
+        both = zip(texts, _parse(texts, needed), strict=True)
+        yield [(text, line) for text, line in both if line is not None or (text.strip() and text.endswith(b"\n"))]
 
 
 def read(path: Path, needed: Iterable[str] = (STEP,)) -> list[Line]:
@@ -40,7 +34,7 @@ def read(path: Path, needed: Iterable[str] = (STEP,)) -> list[Line]:
     if not path.exists():
         return []
     with path.open("rb") as file:
-        return [line for _, lines in batches(file, needed) for line in lines if line is not None]
+        return [line for batch in batches(file, needed) for _, line in batch if line is not None]
 
 
 def _parse(texts: list[bytes], needed: tuple[str, ...]) -> list[Line | None]:
@@ -98,15 +92,13 @@ class Growing:
             warn: is told of it.
         """
         self.path, self.written, self.mark = path, 0, (0, 0)
-        strange = self._rewind(env_steps, tuple(needed))
-        lines, lost = self.mark[0], 0
+        strange = self._rewind(env_steps, tuple(needed), mark[0] if mark else 0)
+        lost = max(0, mark[0] - self.mark[0] - strange) if mark else 0
         if strange:
             warn(f"{path}: {strange} line(s) that cannot be read, set aside in {self._aside.name}")
-        if mark is not None:
-            lost = max(0, mark[0] - lines - strange)
         if lost:
             warn(f"{path}: {lost} of its lines up to step {env_steps} are lost")
-        elif mark is not None and not strange and tuple(mark) != self.mark:
+        elif mark and not strange and tuple(mark) != self.mark:
             warn(f"{path}: lines up to step {env_steps} are not as they were written")
 
     def append(self, lines: Iterable[Line]) -> None:
@@ -122,18 +114,23 @@ class Growing:
     def _aside(self) -> Path:
         return self.path.with_name(f"{self.path.name}.strange")
 
-    def _rewind(self, env_steps: int, needed: tuple[str, ...]) -> int:
-        """How many lines are strange."""
+    def _rewind(self, env_steps: int, needed: tuple[str, ...], written: int) -> int:
+        """How many lines are strange; so is one of the first `written` that is beyond `env_steps`."""
         self.path.touch()
-        beside, strange = self.path.with_suffix(".tmp"), []
+        beside, strange, before = self.path.with_suffix(".tmp"), [], 0
         with self.path.open("rb") as file, beside.open("wb") as rewound:
-            for texts, lines in batches(file, needed):
-                strange += [text for text, line in zip(texts, lines, strict=True) if line is None]
-                known = [(text, line[STEP]) for text, line in zip(texts, lines, strict=True) if line is not None]
-                self.written = max([self.written, *(step for _, step in known)])
-                kept = [text.rstrip(b"\r\n") + b"\n" for text, step in known if step <= env_steps]
+            for batch in batches(file, needed):
+                kept = []
+                for index, (text, line) in enumerate(batch, start=before):
+                    if line is None or (line[STEP] > env_steps and index < written):
+                        strange.append(text)
+                        continue
+                    self.written = max(self.written, line[STEP])
+                    if line[STEP] <= env_steps:
+                        kept.append(text.rstrip(b"\r\n") + b"\n")
                 rewound.writelines(kept)
                 self._count(kept)
+                before += len(batch)
         if strange:  # before they are gone from where they were
             with self._aside.open("ab") as file:
                 file.writelines(strange)

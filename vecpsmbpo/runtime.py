@@ -2,11 +2,14 @@
 
 import logging
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
 
-from vecpsmbpo.settings import Settings
+from vecpsmbpo import words
+from vecpsmbpo.settings import SettingError, Settings
 
 SINGLE_THREADED = "--xla_cpu_multi_thread_eigen=false"
 
@@ -18,6 +21,9 @@ def configure(settings: Settings) -> None:
     matrix products do, and results do not depend on the scheduling of threads. How many of them a run uses is decided
     by `layout`: the jobs of a multirun share a process, and differ in that. JAX ignores the CPU settings where there is
     a GPU.
+
+    Raises:
+        SettingError: JAX finds no device, or not the one that JAX_PLATFORMS asks for.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     flags = os.environ.get("XLA_FLAGS", "")
@@ -33,6 +39,33 @@ def configure(settings: Settings) -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache_dir()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
         jax.config.update("jax_raise_persistent_cache_errors", False)
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:  # the latter where a plug-in is there and its hardware is not
+        asked = os.environ.get("JAX_PLATFORMS")
+        what = f"JAX_PLATFORMS={asked}: no such device here" if asked else f"JAX finds no device ({words.of(error)})"
+        raise SettingError(what) from None
+
+
+def check_flags() -> None:
+    """That XLA knows the flags in XLA_FLAGS, where there are any: it ends the process over one that it does not know.
+
+    Raises:
+        SettingError: it does not.
+    """
+    flags = os.environ.get("XLA_FLAGS", "").strip()
+    if not flags:
+        return
+    tried = subprocess.run(
+        [sys.executable, "-c", "import jax; jax.devices('cpu')"],
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if tried.returncode:
+        said = (tried.stderr.strip() or "XLA does not take them").splitlines()[-1]
+        raise SettingError(f"XLA_FLAGS={flags}: {said.rpartition('] ')[2]}")
 
 
 def cache_dir() -> Path:

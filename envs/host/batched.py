@@ -1,12 +1,19 @@
 """A batch of host simulators: the interface that the host driver steps."""
 
 import abc
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from vecpsmbpo import words
+from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import EnvSpec
+
+
+class SimulatorError(SettingError):
+    """The code of a task failed, or gave what it cannot give: one line."""
 
 
 class Simulator(abc.ABC):
@@ -73,9 +80,14 @@ class HostEnv:
         return len(self.simulators)
 
     def reset(self) -> np.ndarray:
-        """Begins an episode everywhere: obs [B, O]."""
+        """Begins an episode everywhere: obs [B, O].
+
+        Raises:
+            SimulatorError: one failed.
+        """
         self._lengths[:] = 0
-        self._obs = np.stack([simulator.reset() for simulator in self.simulators]).astype(np.float32)
+        with _others_code():
+            self._obs = np.stack([self._shaped(simulator.reset()) for simulator in self.simulators])
         return self._obs
 
     def step(self, actions: np.ndarray) -> HostStep:
@@ -85,25 +97,38 @@ class HostEnv:
 
         Raises:
             ValueError: `actions` has another shape.
+            SimulatorError: one failed. What it and the others did until then is not undone.
         """
         if np.shape(actions) != (self.num_envs, self.spec.action_size):
             expected = (self.num_envs, self.spec.action_size)
             raise ValueError(f"actions must have shape {expected}, not {np.shape(actions)}")
         # NaN: of a policy that has diverged, until its lane is frozen. Some simulators fail at it.
         actions = np.clip(np.nan_to_num(np.asarray(actions, np.float64)), -1.0, 1.0)
-        results = [simulator.step(action) for simulator, action in zip(self.simulators, actions, strict=True)]
-        next_obs, reward, terminated, cut = (np.asarray(column) for column in zip(*results, strict=True))
-        with np.errstate(over="ignore"):  # to infinity, which is looked for
-            next_obs, reward = next_obs.astype(np.float32), reward.astype(np.float32)
+        with _others_code():
+            results = [simulator.step(action) for simulator, action in zip(self.simulators, actions, strict=True)]
+            obs, rewards, terminated, cut = zip(*results, strict=True)
+            next_obs = np.stack([self._shaped(one) for one in obs])
+            with np.errstate(over="ignore"):  # to infinity, which is looked for
+                reward = np.asarray(rewards, np.float64).astype(np.float32)
+            terminated, cut = np.asarray(terminated, bool), np.asarray(cut, bool)
         sound = np.isfinite(np.column_stack([self._obs, next_obs, reward])).all(axis=1)
         terminated = terminated & sound
         self._lengths += 1
         truncated = (cut | (self._lengths >= self.episode_length) | ~sound) & ~terminated
         self._obs = next_obs.copy()
         for index in np.flatnonzero(terminated | truncated):
-            self._obs[index] = self.simulators[index].reset()
+            with _others_code():
+                self._obs[index] = self._shaped(self.simulators[index].reset())
             self._lengths[index] = 0
         return HostStep(self._obs, reward, terminated, truncated, next_obs, sound)
+
+    def _shaped(self, obs: Any) -> np.ndarray:
+        """An observation as float32."""
+        with np.errstate(over="ignore"):  # as in `step`
+            found = np.asarray(obs).astype(np.float32)
+        if found.shape != (self.spec.obs_size,):
+            raise SimulatorError(f"an observation has shape {found.shape}, not ({self.spec.obs_size},)")
+        return found
 
     def save(self) -> dict[str, Any]:
         """The state of every simulator, in JSON's types."""
@@ -120,3 +145,14 @@ class HostEnv:
         for simulator, state in zip(self.simulators, saved["simulators"], strict=True):
             simulator.load(state)
         return self._obs
+
+
+@contextlib.contextmanager
+def _others_code() -> Iterator[None]:
+    """Turns whatever a simulator raises, leaving the program included, into one line."""
+    try:
+        yield
+    except SimulatorError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise SimulatorError(words.of(error)) from error

@@ -1,5 +1,7 @@
 """Anybody's own JAX environment."""
 
+import jax
+import jax.numpy as jnp
 from brax.envs.base import Env
 
 from vecpsmbpo.envs import custom
@@ -16,10 +18,14 @@ def own_task(*, make: str) -> Env:
 
     Raises:
         SettingError: it is something else.
+        Exception: whatever its `reset` and `step` raise.
     """
     env = custom.load(make)
     if not isinstance(env, Env):
         raise SettingError(f"env.make={make}: gives {type(env).__name__}, not a brax.envs.base.Env; or backend=host")
-    if hasattr(env, "spec"):
-        return env
-    return Adapter(env, f"env.make={make}", make.rpartition(":")[2], EPISODE_LENGTH, None)
+    if not hasattr(env, "spec"):
+        env = Adapter(env, f"env.make={make}", make.rpartition(":")[2], EPISODE_LENGTH, None)
+    # A mistake in it shows here, and not in the middle of a program that it is a small part of.
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.spec.action_size,), jnp.float32))
+    return env

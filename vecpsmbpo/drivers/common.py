@@ -33,6 +33,20 @@ class Returns(NamedTuple):
     length: np.ndarray
 
 
+class Interrupted(Exception):
+    """A simulator failed in a chunk.
+
+    Attributes:
+        step: the environment step that it failed at.
+        state: as the stride began that this step is in; `save_env` is of that moment, too.
+        news: of the strides before, as `Driver.run` gives them; None: it was in the first.
+    """
+
+    def __init__(self, step: int, state: TrainState, news: EpisodeEnd | None, why: Exception):
+        super().__init__(str(why))
+        self.step, self.state, self.news = step, state, news
+
+
 class EpisodeKeys(NamedTuple):
     """Of evaluation episodes. Resets and actions need keys of their own: what a reset splits its key into are the very
     keys that `fold_in` makes of it for the first steps.
@@ -63,7 +77,11 @@ class Driver(Protocol):
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
         """A chunk, of an epoch at most. The state given is consumed. News have leaves [strides * stride, S, ...]; there
-        are none of frozen lanes."""
+        are none of frozen lanes.
+
+        Raises:
+            Interrupted: a simulator failed.
+        """
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
         """Whole episodes of the evaluation policy, in environments of their own. keys [S]."""

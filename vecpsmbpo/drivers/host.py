@@ -15,6 +15,7 @@ from vecpsmbpo.drivers.common import (
     BY_SEED,
     COMPILED_QUICKLY,
     SHARED,
+    Interrupted,
     Returns,
     compiled,
     evaluation_actions,
@@ -22,7 +23,7 @@ from vecpsmbpo.drivers.common import (
     many,
     split_for_episodes,
 )
-from vecpsmbpo.envs.host.batched import HostEnv
+from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
 from vecpsmbpo.schedule import begin_stride, observe_and_learn, over_seeds, split_keys
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
@@ -63,6 +64,7 @@ class HostDriver:
             (BY_SEED, BY_SEED),
         )
         self._compiled_evaluation_actions: Any = None
+        self._saved_env: dict[str, Any] | None = None  # as the running stride began
 
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         return self._init(keys, hyper, jnp.asarray(self._env.reset()))
@@ -93,16 +95,25 @@ class HostDriver:
         self._compiled_evaluation_actions = actions
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
-        news = []
+        news: list[EpisodeEnd] = []
         for _ in range(strides):
+            self._saved_env = self._env.save()
             before, state, learning = self._begin(state)
-            ends = []
-            for _ in range(self.settings.stride):
-                state, end = self._step(state, learning)
-                ends.append(end)
+            ends: list[EpisodeEnd] = []
+            try:
+                for _ in range(self.settings.stride):
+                    state, end = self._step(state, learning)
+                    ends.append(end)
+            except SimulatorError as error:
+                # Rows that were written to the rings lie beyond the counters, and will be written again.
+                rings = {"real": state.seeds.real, "imagined": state.seeds.imagined}
+                step = int(before.counters.env_steps) + len(ends) + 1
+                whole = before.replace(seeds=before.seeds.replace(**rings))
+                raise Interrupted(step, whole, _stacked(news), error) from error
             state, frozen = self._settle(before, state)
             news += [end.replace(done=end.done & ~np.asarray(frozen)) for end in ends]
-        return state, jax.tree.map(lambda *xs: np.stack(xs), *news)
+        self._saved_env = None
+        return state, _stacked(news)
 
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
         obs = state.env
@@ -138,7 +149,7 @@ class HostDriver:
         return Returns(total.reshape(seeds, episodes), length.reshape(seeds, episodes))
 
     def save_env(self) -> dict[str, Any]:
-        return self._env.save()
+        return self._saved_env or self._env.save()
 
     def load_env(self, saved: dict[str, Any]) -> None:
         self._env.load(saved)
@@ -175,3 +186,8 @@ class HostDriver:
             self.algorithm, state.counters, seeds, transition, truncated, keys, learning
         )
         return TrainState(counters, seeds, obs), end
+
+
+def _stacked(news: list[EpisodeEnd]) -> Any:
+    """News of steps, leaves [S, ...] each, as those of a chunk, [T, S, ...]; None of none."""
+    return jax.tree.map(lambda *xs: np.stack(xs), *news) if news else None

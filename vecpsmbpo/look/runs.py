@@ -169,9 +169,9 @@ def read(path: Path, needed: Iterable[str] = ("env_steps", "seed")) -> Log:
     damaged = 0
     parts: list[Columns] = []
     with path.open("rb") as file:
-        for _, found in jsonl.batches(file, needed):
-            lines = [line for line in found if line is not None]
-            damaged += len(found) - len(lines)
+        for batch in jsonl.batches(file, needed):
+            lines = [line for _, line in batch if line is not None]
+            damaged += len(batch) - len(lines)
             if lines:
                 parts.append(_columns(lines))
     return Log(_concatenate(parts), damaged)

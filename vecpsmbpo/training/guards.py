@@ -22,6 +22,7 @@ except ImportError:  # Windows
 DISK_ERRORS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
     | {errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG}
+    | {errno.ENOENT, errno.EMFILE, errno.ENFILE}
 )
 
 
@@ -38,7 +39,8 @@ class Stop:
 
 @contextlib.contextmanager
 def heeding_signals() -> Iterator[Stop]:
-    """SIGINT and SIGTERM ask the run to stop after its chunk; a second one stops it at once.
+    """SIGINT, SIGTERM and SIGHUP ask the run to stop after its chunk; a second one stops it at once. SIGHUP that is
+    ignored, as `nohup` has it, stays so.
 
     Only the main thread of a program may say what signals do; in another one they stay what they are.
     """
@@ -51,14 +53,28 @@ def heeding_signals() -> Iterator[Stop]:
         if stop.requested is not None:
             raise KeyboardInterrupt
         stop.requested = number
-        print("\nfinishing this chunk and saving; once more to stop at once", file=sys.stderr, flush=True)
+        try:
+            print("\nfinishing this chunk and saving; once more to stop at once", file=sys.stderr, flush=True)
+        except OSError:  # the terminal is gone, and must not take the run with it
+            _speak_to_nobody()
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, ask) for number in numbers}
     try:
         yield stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _speak_to_nobody() -> None:
+    """Whatever is printed from now on is lost."""
+    nobody = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nobody, stream)
+    os.close(nobody)
 
 
 @contextlib.contextmanager

@@ -10,13 +10,14 @@ import jax
 import numpy as np
 
 from vecpsmbpo import checkpoint, config, crash, health, jsonl, metrics, resources, runtime, versions
-from vecpsmbpo.drivers import Driver, Returns
+from vecpsmbpo.drivers import Driver, Interrupted, Returns
+from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.look import report
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.training.guards import Stop, alone_in, disk_errors, heeding_signals
 from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
-from vecpsmbpo.types import TrainState
+from vecpsmbpo.types import EpisodeEnd, TrainState
 
 # An epoch that takes longer than this is run in chunks of about half of it, to show progress and to heed signals.
 LONG_EPOCH_S = 20.0
@@ -26,7 +27,7 @@ def train(settings: Settings) -> int:
     """Runs, or goes on with, the run in `settings.run_dir`.
 
     Returns:
-        0, 1 where a lane is frozen (`health`), or 128 + the number of the signal that stopped it.
+        0, 1 where a lane is frozen (`health`) or a simulator failed, or 128 + the number of the signal that stopped it.
 
     Raises:
         SettingError: it cannot be run as asked (`resources.check_memory`, `envs.make`), or not be gone on with. Nothing
@@ -94,6 +95,10 @@ class _Session:
                     self._chunk()
                 self._save()
                 return self._farewell(stop)
+        except Interrupted as error:
+            return self._failed(f"at step {error.step}", error)
+        except SimulatorError as error:
+            return self._failed(f"in the evaluation at step {self.env_steps}", error)
         finally:
             self.log.close()
             self.checkpoints.close()
@@ -133,16 +138,25 @@ class _Session:
             self.epoch_began, self.epoch_steps_done = time.perf_counter(), 0
         strides = self._strides(settings.epoch_steps - into_epoch)
         began = time.perf_counter()
-        self.state, news = self.driver.run(self.state, strides)
+        news: EpisodeEnd | None
+        failed: Interrupted | None = None
+        try:
+            self.state, news = self.driver.run(self.state, strides)
+        except Interrupted as error:
+            self.state, news, failed = error.state, error.news, error
         seconds = time.perf_counter() - began
         self.stride_s = seconds / strides
-        steps = strides * settings.stride
+        steps = 0 if news is None else len(news.done)
         before, self.env_steps = self.env_steps, self.env_steps + steps
         self.epoch_steps_done += steps
-        episodes = metrics.episode_lines(news, before, settings)
-        self.log.episodes(episodes)
-        self.display.chunk(self.env_steps, steps, seconds, [line["return"] for line in episodes])
+        if news is not None:
+            episodes = metrics.episode_lines(news, before, settings)
+            self.log.episodes(episodes)
+            self.display.chunk(self.env_steps, steps, seconds, [line["return"] for line in episodes])
         self._note_frozen()
+        if failed:
+            self._save()
+            raise failed
         if self.env_steps % settings.epoch_steps == 0 and not self.frozen.all():
             self._end_epoch()
 
@@ -250,10 +264,25 @@ class _Session:
             self.display.say("stopped: every lane is frozen; what is saved is the last good state of each")
             return self._status
         if self.env_steps < self.settings.total_steps:
-            self.display.say(f"to continue: vecpsmbpo train {shlex.quote(f'run_dir={self.run_dir}')}")
+            self.display.say(f"to continue: {self._to_continue}")
             return 128 + (stop.requested or 0)
         self.display.say(f"to evaluate: vecpsmbpo eval {shlex.quote(f'run_dir={self.run_dir}')} episodes=10")
         return self._status
+
+    def _failed(self, where: str, error: Exception) -> int:
+        """Says that the task's own code failed; the exit status."""
+        print(
+            f"vecpsmbpo: {self.settings.task} failed {where}: {error}; saved at step {self.saved_step}; to continue: "
+            f"{self._to_continue}",
+            file=sys.stderr,
+            flush=True,
+        )
+        return 1
+
+    @property
+    def _to_continue(self) -> str:
+        """The command, as a shell and Hydra read it."""
+        return f"vecpsmbpo train {shlex.quote(config.as_override('run_dir', self.run_dir))}"
 
 
 def _check_not_emptied(run_dir: Path) -> None:

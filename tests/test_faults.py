@@ -1,0 +1,204 @@
+"""What careless commands, surroundings and tasks do: one line each. In this process, where nothing has to start."""
+
+import io
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from tests.helpers import environment, tiny
+from vecpsmbpo import cli, config, envs, runtime, words
+from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
+from vecpsmbpo.settings import SettingError
+from vecpsmbpo.training import guards
+from vecpsmbpo.types import EnvSpec
+
+SUITE = ["env=gymnasium", "backend=host"]
+CARELESS = [
+    (["temperature=1e-320"], "temperature=1e-320: must be 0 or between"),
+    (["temperature=1e39"], "temperature=1e+39: must be 0 or between"),
+    (["model_learning_rate=1e-50"], "model_learning_rate=1e-50: must be 0 or between"),
+    (["target_entropy=-1e39"], "target_entropy=-1e+39: must be 0 or between"),
+    (["sweep.temperature=[1,1e-50]"], "temperature=1e-50: must be 0 or between"),
+    (["sweep.real_ratio=[0.1,0.10000000001]"], "sweep.real_ratio=[0.1, 0.10000000001]: two of its values are the same"),
+    (["sweep.temperature=[.inf,.inf]"], "sweep.temperature="),
+    (["episode_length=1e10"], "episode_length=10000000000.0: must be at most 2147483647"),
+    (["model_hidden_size=1e10"], "model_hidden_size=10000000000.0: must be at most 2147483647"),
+    (["rollout_starts=9999999999"], "rollout_starts=9999999999: must be at most 2147483647"),
+    (["seed=3000000000"], "seed=3000000000: must be at most 2147483647"),
+    (["num_seeds=1000000000"], "num_seeds=1000000000: at most 10000 seeds"),
+    (["num_seeds=6000", "sweep.real_ratio=[0,1]"], "num_seeds=6000: at most 10000 seeds"),
+    (["~seed=0"], "~seed=0: a setting cannot be taken away"),
+    (["run_dir=${nosuch}"], "Interpolation key 'nosuch' not found"),
+    ([f"run_dir={'x' * 300}"], f"run_dir={'x' * 300}: File name too long"),
+    (["-m", "seed=0,0"], "seed=0,0: the same value twice"),
+    *(([*SUITE, f"env.id={wrong}"], "env.id=") for wrong in ("5", "null", "[1,2]", "''", "{a: 1}", "true")),
+]
+
+
+@pytest.mark.parametrize(("arguments", "line"), CARELESS, ids=lambda value: " ".join(value)[:40])
+def test_a_careless_command_is_one_line(arguments, line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["train", *arguments]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith(f"vecpsmbpo: {line}")
+    assert (said.err.count("\n"), said.out) == (1, "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_default_run_directory_of_many_overrides_has_a_name_that_fits():
+    many = [f"{name}=0.{'1' * 15}" for name in ("real_ratio", "temperature", "discount", "target_entropy")]
+    many += [f"{name}=0.{'1' * 15}" for name in ("policy_learning_rate", "model_learning_rate", "gae_decay")]
+    names = {config.compose([*many, f"model_weight_decay={value}"]).run_dir for value in (0.1, 0.2)}
+    assert len(names) == 2
+    assert all(len(name) < 255 for name in names)
+
+
+TASKS = {
+    "number = 5": ":number",
+    "class Wants:\n    def __init__(self, x): pass": ":Wants",
+    "def fails(): raise KeyError('no')": ":fails",
+    "def leaves(): raise SystemExit(0)": ":leaves",
+    "import nowhere_at_all": ":X",
+    "raise RuntimeError('at import')": ":X",
+    "def (": ":X",
+    "raise SystemExit(0)": ":X",
+    "import os": ":os",
+    "X = None": "",
+    "Y = None": ":X",
+    "from gymnasium import Env as X": ":X",
+}
+
+
+@pytest.mark.parametrize("backend", ["host", "mjx"])
+def test_a_task_that_cannot_be_made_is_one_line(backend, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for index, (code, attribute) in enumerate(TASKS.items()):
+        make = f"careless_{backend}_{index}{attribute}"
+        (tmp_path / f"careless_{backend}_{index}.py").write_text(code)
+        with pytest.raises(SettingError, match=r"env\.make=careless") as error:
+            envs.make("custom", backend, make=make)
+        assert "\n" not in str(error.value)
+
+
+def test_an_exception_in_one_line_says_where_it_was_raised():
+    with pytest.raises(KeyError) as found:
+        {}["x"]
+    assert re.fullmatch(rf"KeyError: 'x' at {__file__}:\d+", words.of(found.value))
+
+
+class Simulator:
+    """Gives what it was made with."""
+
+    def __init__(self, *results):
+        self._results = iter(results)
+
+    def reset(self):
+        return np.zeros(2)
+
+    def step(self, action):
+        result = next(self._results)
+        if isinstance(result, BaseException):
+            raise result
+        return result
+
+
+@pytest.mark.parametrize(
+    ("result", "line"),
+    [
+        (ValueError("the motor is hot"), "ValueError: the motor is hot at "),
+        (SystemExit(0), "SystemExit: 0 at "),
+        ((np.zeros(3), 0.0, False, False), r"an observation has shape \(3,\), not \(2,\)"),
+        ((np.zeros((1, 2)), 0.0, False, False), r"an observation has shape \(1, 2\), not"),
+        ((None, 0.0, False, False), "an observation has shape|TypeError"),
+        ((np.zeros(2), [1.0, 2.0], False, False), "ValueError|TypeError"),
+        ((np.zeros(2), 0.0, False), "ValueError"),
+    ],
+)
+def test_what_a_simulator_cannot_give_is_one_line(result, line):
+    fine = (np.zeros(2), 0.0, False, False)
+    env = HostEnv(EnvSpec("mine", 2, 1, 10, None), [Simulator(fine, fine), Simulator(fine, result)])
+    env.reset()
+    env.step(np.zeros((2, 1)))
+    with pytest.raises(SimulatorError, match=line) as error:
+        env.step(np.zeros((2, 1)))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("Unable to initialize backend"), AssertionError()])
+def test_a_device_that_is_not_there_is_one_line(error, monkeypatch):
+    def fail():
+        raise error
+
+    monkeypatch.setattr(jax, "devices", fail)
+    monkeypatch.setenv("JAX_PLATFORMS", "foo")
+    with pytest.raises(SettingError, match="JAX_PLATFORMS=foo: no such device here"):
+        runtime.configure(tiny())
+    monkeypatch.delenv("JAX_PLATFORMS")
+    with pytest.raises(SettingError, match="JAX finds no device"):
+        runtime.configure(tiny())
+
+
+def test_a_flag_that_xla_does_not_know_is_one_line(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(subprocess, "run", pytest.fail)
+    runtime.check_flags()  # costs nothing where there are none
+    monkeypatch.undo()
+    monkeypatch.setenv("XLA_FLAGS", "--xla_foo=1")
+    with pytest.raises(SettingError, match="XLA_FLAGS=--xla_foo=1: Unknown flag in XLA_FLAGS: --xla_foo=1"):
+        runtime.check_flags()
+
+
+@pytest.mark.parametrize("name", ["runs/x", "a=b", "5", "a b", "λ, τ", "it's", "null", "[1]", "$HOME", "a\\", "{x}"])
+def test_the_command_to_continue_names_the_run_to_a_shell_and_to_hydra(name):
+    command = shlex.quote(config.as_override("run_dir", name))
+    (argument,) = shlex.split(command)
+    assert config.parse([argument]) == {"run_dir": name}
+
+
+def test_a_terminal_without_greek_letters_is_no_reason_to_fail(monkeypatch):
+    shown = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
+    monkeypatch.setattr(sys, "stdout", shown)
+    assert cli.main(["--version"]) == 0
+    print("λ = 0.5")
+    assert shown.buffer.getvalue().endswith(b"? = 0.5\n")
+
+
+def test_what_the_system_refuses_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(cli, "_dispatch", lambda arguments: os.stat("/nowhere/at/all"))
+    assert cli.main([]) == 2
+    assert capsys.readouterr().err == "vecpsmbpo: /nowhere/at/all: No such file or directory\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
+def test_signals_that_ask_a_run_to_stop(number, capfd):
+    with guards.heeding_signals() as stop:
+        os.kill(os.getpid(), number)
+        assert stop.requested == number
+    assert "finishing this chunk and saving" in capfd.readouterr().err
+
+
+def test_a_run_under_nohup_outlives_its_terminal():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with guards.heeding_signals() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert stop.requested is None
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_control_c_is_not_lost_in_an_import(tmp_path):
+    program = (
+        "import os, signal, time\nfrom vecpsmbpo import cli\nwith cli._nothing_to_save():\n    try:\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n        time.sleep(9)\n    except BaseException:\n        pass\n"
+    )
+    arguments = [sys.executable, "-c", program]
+    result = subprocess.run(arguments, env=environment(), capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stderr) == (130, "vecpsmbpo: interrupted\n")

@@ -1,0 +1,275 @@
+"""Tries what can befall a run, and counts: the same end as undisturbed, one line that says what is wrong, or a fault.
+
+    tools/faults                               all parts, and 100 kills of each driver; hours
+    tools/faults part=careless,files           some
+    tools/faults part=kills kills=20           fewer kills
+
+Each part replaces its own rows of results/faults.csv. Parts:
+    careless    commands and tasks with a mistake: one line, exit status 2, nothing created
+    files       each file of a run directory truncated, emptied, replaced by noise, one bit flipped; then gone on with
+    signals     SIGINT, SIGTERM, SIGHUP: saved within 10 s of the chunk, and gone on with
+    twice       a second process in the directory of a run
+    disk        disks of many sizes, which fill up in one write or another; then made larger, and gone on with
+    kills       kill -9 at random moments until the run is complete
+"""
+
+import contextlib
+import csv
+import io
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tests.helpers import argv, environment
+from tools.careless import COMMANDS, MODULES
+from vecpsmbpo import cli, metrics
+
+OUT = Path("results/faults.csv")
+RUN = ["size=tiny", "env=ball_in_cup", "loggers=[]"]  # 40 steps an epoch, a checkpoint each
+STOPPED, END = 120, 160
+SAVED_WITHIN_S = 10.0
+ANSWER_S = 100
+DISKS_KB = (64, 400, 800, 1100, 1200, 1300, 1400, 1600, 1800, 2000, 2200, 2400, 2600)
+Found = tuple[str, str]  # what was tried, and how it ended: FINE or what was wrong
+SAME, ONE_LINE = "same end", "one line"
+FINE = (SAME, ONE_LINE)
+
+
+# ── what a run has come to ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def lines(run_dir: Path) -> list[dict]:
+    """Of both logs, without what depends on the clock."""
+    clock = {"env_steps_per_s", "updates_per_s", "imagined_per_s", "seconds", "compile_seconds"}
+    files = (metrics.METRICS_FILE, metrics.EPISODES_FILE)
+    return [
+        {k: v for k, v in line.items() if k not in clock} for name in files for line in metrics.read(run_dir / name)
+    ]
+
+
+def arrays(run_dir: Path) -> int:
+    """A checksum of the whole state at the end."""
+    return json.loads((run_dir / f"checkpoints/{END}/host/metadata").read_text())["arrays"]
+
+
+def same_end(run_dir: Path, undisturbed: Path) -> str:
+    if arrays(run_dir) != arrays(undisturbed):
+        return "another end"
+    return SAME if lines(run_dir) == lines(undisturbed) else "other logs"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def one_line(status: int, errors: str, expected: int = 2) -> str:
+    told = [line for line in errors.splitlines() if line.startswith("vecpsmbpo: ") and "warning" not in line]
+    others = [line for line in errors.splitlines() if not line.startswith("vecpsmbpo: ")]
+    return ONE_LINE if (status, len(told), others) == (expected, 1, []) else f"status {status}: {errors[-200:]!r}"
+
+
+def here(arguments: list[str]) -> tuple[int, str]:
+    """A command in this process, which has compiled the program already: its exit status and what it said."""
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            status = cli.main(["train", *arguments])
+        except BaseException as error:  # the fault that is looked for
+            said.write(repr(error))
+            status = -1
+    return status, said.getvalue()
+
+
+def command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess:
+    process = started(*arguments, cwd=cwd)
+    said, errors = process.communicate()
+    return subprocess.CompletedProcess(arguments, process.returncode, said, errors)
+
+
+def started(*arguments: str, cwd: Path) -> subprocess.Popen:
+    pipe, train = subprocess.PIPE, argv("train", *arguments, one_thread=True)
+    return subprocess.Popen(train, cwd=cwd, env=environment(), stdout=pipe, stderr=pipe, text=True)
+
+
+def undisturbed(folder: Path, backend: str) -> Path:
+    result = command(*RUN, f"backend={backend}", f"total_steps={END}", "run_dir=undisturbed", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return folder / "undisturbed"
+
+
+# ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def careless(folder: Path, options: dict) -> Iterator[Found]:
+    for name, code in MODULES.items():
+        (folder / f"{name}.py").write_text(code)
+    before = contents(folder)
+    for words, surroundings in COMMANDS:
+        surrounded = {**environment(), **surroundings, "PYTHONDONTWRITEBYTECODE": "1"}
+        program = [sys.executable, "-m", "vecpsmbpo.cli", *words]
+        try:
+            result = subprocess.run(
+                program, cwd=folder, env=surrounded, capture_output=True, text=True, timeout=ANSWER_S, check=False
+            )
+            ended = one_line(result.returncode, result.stderr)
+        except subprocess.TimeoutExpired:
+            ended = f"no answer within {ANSWER_S} s"
+        left = contents(folder).keys() - before.keys()
+        set_as = "".join(f"{name}={value} " for name, value in surroundings.items())
+        yield f"{set_as}{' '.join(words)}"[:80], f"left {sorted(left)}" if left else ended
+
+
+def files(folder: Path, options: dict) -> Iterator[Found]:
+    run, whole = [*RUN, "backend=host"], folder / "stopped"
+    assert here([*run, f"total_steps={STOPPED}", f"run_dir={whole}"])[0] == 0
+    reference = folder / "reference"
+    shutil.copytree(whole, reference)
+    assert here([f"run_dir={reference}", f"total_steps={END}"])[0] == 0
+    for which, damage in ((which, damage) for which in _kinds(whole) for damage in DAMAGES):
+        damaged = folder / "damaged"
+        shutil.rmtree(damaged, ignore_errors=True)
+        shutil.copytree(whole, damaged)
+        DAMAGES[damage](damaged / which)
+        before = contents(damaged)
+        status, said = here([f"run_dir={damaged}", f"total_steps={END}"])
+        if status == 0:
+            ended = same_end(damaged, reference)
+            if ended == "other logs" and any(told in said for told in ("set aside", "are lost", "not as they were")):
+                ended = SAME  # and what is lost is said
+        else:
+            ended = one_line(status, said) if contents(damaged) == before else "it has been changed"
+        yield f"{which} {damage}", ended
+
+
+def _kinds(run_dir: Path) -> list[Path]:
+    """One file of each kind in a run directory."""
+    found: dict[str, Path] = {}
+    newest = f"checkpoints/{STOPPED}"
+    for path in sorted(run_dir.rglob("*"), key=lambda path: -path.stat().st_size):
+        name = path.relative_to(run_dir)
+        if path.is_file() and path.stat().st_size and (name.parts[0] != "checkpoints" or newest in str(name)):
+            found.setdefault("array" if path.name[0].isdigit() else f"{name.parts[0]}/{path.name}", name)
+    return list(found.values())
+
+
+def _flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1 << 2
+    path.write_bytes(content)
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "emptied": lambda path: path.write_bytes(b""),
+    "noise": lambda path: path.write_bytes(random.Random(0).randbytes(path.stat().st_size)),
+    "one bit flipped": _flip,
+}
+
+
+def signals(folder: Path, options: dict) -> Iterator[Found]:
+    reference = undisturbed(folder, "host")
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        name = signal.Signals(number).name
+        process = started(*RUN, "backend=host", f"total_steps={END}", f"run_dir={name}", cwd=folder)
+        next(line for line in process.stdout if line.startswith("step"))
+        process.send_signal(number)
+        began = time.perf_counter()
+        said, errors = process.communicate()
+        seconds = time.perf_counter() - began
+        if process.returncode != 128 + number or seconds > SAVED_WITHIN_S or "to continue: " not in said:
+            yield name, f"status {process.returncode} after {seconds:.0f} s: {errors[-200:]!r}"
+            continue
+        command(f"run_dir={name}", cwd=folder)
+        yield name, same_end(folder / name, reference)
+
+
+def twice(folder: Path, options: dict) -> Iterator[Found]:
+    arguments = (*RUN, "backend=host", f"total_steps={END}", "run_dir=run")
+    first = started(*arguments, cwd=folder)
+    next(line for line in first.stdout if line.startswith("compiling"))
+    first.send_signal(signal.SIGSTOP)
+    second = command(*arguments, cwd=folder)
+    first.send_signal(signal.SIGCONT)
+    first.communicate()
+    yield "the second process", one_line(second.returncode, second.stderr)
+    yield "the first process", same_end(folder / "run", undisturbed(folder, "host"))
+
+
+def disk(folder: Path, options: dict) -> Iterator[Found]:
+    reference, small = undisturbed(folder, "host"), folder / "disk"
+    small.mkdir()
+    for size in DISKS_KB:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", small], check=True)
+        try:
+            arguments = (*RUN, "backend=host", f"total_steps={END}", "run_dir=disk/run")
+            result = command(*arguments, cwd=folder)
+            ended = SAME if result.returncode == 0 else one_line(result.returncode, result.stderr)
+            if ended in FINE:
+                subprocess.run(["mount", "-o", "remount,size=64m", small], check=True)
+                command(*arguments, cwd=folder)
+                ended = same_end(small / "run", reference)
+        finally:
+            subprocess.run(["umount", small], check=True)
+        yield f"{size} KiB", ended
+
+
+def kills(folder: Path, options: dict) -> Iterator[Found]:
+    dice = random.Random(0)
+    for backend in ("host", "mjx"):
+        began = time.perf_counter()
+        reference = undisturbed(folder, backend)
+        longest, done, runs = time.perf_counter() - began, 0, 0
+        while done < int(options["kills"]):
+            runs += 1
+            run_dir, before = f"{backend}{runs}", done
+            while True:
+                process = started(*RUN, f"backend={backend}", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
+                try:
+                    process.communicate(timeout=dice.uniform(0, longest) if done < int(options["kills"]) else None)
+                    break
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.communicate()
+                    done += 1
+            yield f"{backend}: {done - before} kills of run {runs}", same_end(folder / run_dir, reference)
+
+
+PARTS = {part.__name__: part for part in (careless, files, signals, twice, disk, kills)}
+
+
+def main(arguments: list[str]) -> int:
+    options = {"part": ",".join(PARTS), "kills": "100", **dict(text.split("=", 1) for text in arguments)}
+    bad = 0
+    for name in options["part"].split(","):
+        rows = []
+        with tempfile.TemporaryDirectory() as folder:
+            for what, ended in PARTS[name](Path(folder).resolve(), options):
+                print(f"{name}: {what}: {ended}", flush=True)
+                rows.append({"part": name, "what": what, "ended": ended})
+        keep(name, rows)
+        bad += sum(row["ended"] not in FINE for row in rows)
+        print(f"{name}: {len(rows)} tried, {sum(row['ended'] not in FINE for row in rows)} faults", flush=True)
+    return int(bad > 0)
+
+
+def keep(part: str, rows: list[dict]) -> None:
+    """Puts the rows in the place of those that the table had of this part."""
+    others = list(csv.DictReader(OUT.open())) if OUT.exists() else []
+    rows = [row for row in others if row["part"] != part] + rows
+    with OUT.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["part", "what", "ended"], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(sorted(rows, key=lambda row: list(PARTS).index(row["part"])))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
