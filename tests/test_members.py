@@ -166,6 +166,18 @@ def test_plans_are_diagnosed_as_far_as_they_can_be(tmp_path):
     assert (found["critics"], found["states"]) == (None, None)
 
 
+def test_members_and_checkpoints_share_a_compiled_policy(trained):
+    run, obs = runs.load(trained), np.zeros((1, 5), np.float32)
+    before = [program._cache_size() for program in (members._mean_action, members._evaluation_action)]
+    actions = []
+    for one in members.load_each(run):
+        for who in ("all", "best"):
+            actions += [np.asarray(act(obs)) for _, act in members.acting(one, who)]
+    after = [program._cache_size() for program in (members._mean_action, members._evaluation_action)]
+    assert len({action.tobytes() for action in actions}) > 4  # each acts for itself
+    assert np.subtract(after, before).max() <= 1
+
+
 # ── videos ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 

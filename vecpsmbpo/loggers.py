@@ -151,9 +151,7 @@ class TensorBoard:
 class Remote:
     """A logger on a thread of its own."""
 
-    def __init__(
-        self, make: Callable[[], Logger], failed: Callable[[Exception], None], reached: Callable[[int], None]
-    ):
+    def __init__(self, make: Callable[[], Logger], failed: Callable[[Exception], None], reached: Callable[[int], None]):
         """Both are called on that thread.
 
         Args:
