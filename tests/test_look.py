@@ -27,6 +27,12 @@ def test_plot_draws_every_kind_of_file(mixed, suffix, tmp_path, capsys):
             assert said in text
 
 
+def test_plot_draws_the_seeds_of_a_single_group_thin(mixed, tmp_path):
+    for paths, thin in ((mixed[:1], 2), (mixed, 0)):
+        assert cli.main(["plot", *map(str, paths), f"out={tmp_path / 'a.svg'}"]) == 0
+        assert (tmp_path / "a.svg").read_text().count("stroke-opacity: 0.45") == thin
+
+
 def test_plot_writes_the_numbers(mixed, tmp_path):
     out = tmp_path / "curves.csv"
     assert cli.main(["plot", str(mixed[0]), "y=eval_return,critic_loss", f"out={out}"]) == 0

@@ -264,6 +264,15 @@ def test_a_strip_goes_from_the_first_frame_to_the_last():
     np.testing.assert_array_equal(render.strip(frames)[0, ::8, 0], [0, 3, 6, 9])
 
 
+def test_what_is_small_keeps_its_colour_in_a_gif(tmp_path):
+    frame = np.random.default_rng(0).integers(0, 90, (60, 80, 3)).astype(np.uint8)
+    frame[..., 2] += 90  # a restless blue
+    frame[30:34, 40:44] = 230, 165, 95
+    render._write([frame, frame], 0.04, tmp_path / "a.gif")
+    shown = np.asarray(Image.open(tmp_path / "a.gif").convert("RGB"), int)
+    assert np.abs(shown[30:34, 40:44] - (230, 165, 95)).max() < 20
+
+
 def test_a_mosaic_has_its_tiles_in_rows():
     shades = [20, 60, 100]
     tiles = [render.Tile("", np.full((30, 40, 3), shade, np.uint8), 0.0, shade == 100) for shade in shades]
