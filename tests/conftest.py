@@ -12,12 +12,25 @@ os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2 --xla_cpu_mu
 import jax
 import pytest
 
+from tests import looks
+
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 @pytest.fixture
 def key() -> jax.Array:
     return jax.random.key(0)
+
+
+@pytest.fixture
+def mixed(tmp_path):
+    """OPS-MBPO with a frozen seed and PS-MBPO with one that is behind."""
+    frozen = looks.epochs([5, 6], seed=1)
+    frozen[-1]["frozen"] = True
+    ops = looks.write(tmp_path / "ops", looks.epochs([1, 2, 3]) + frozen, num_seeds=2)
+    behind = looks.epochs([0, 1, 2]) + looks.epochs([2, 3], seed=1)
+    ps = looks.write(tmp_path / "ps", behind, num_seeds=2, algo="ps_mbpo")
+    return [ops, ps]
 
 
 LONGEST = (

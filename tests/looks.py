@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from vecpsmbpo import config
+from vecpsmbpo.look import compare
 from vecpsmbpo.settings import Settings
 
 
@@ -71,3 +72,8 @@ def write(path: Path, lines: list[dict], actors: list[dict] = (), **settings: An
     for name, content in (("metrics.jsonl", lines), ("episodes.jsonl", actors)):
         (path / name).write_text("".join(json.dumps(line) + "\n" for line in content))
     return path
+
+
+def options(**changes: Any) -> dict[str, Any]:
+    """What `compare` is told where nothing is said, and `changes`."""
+    return {name: option.default for name, option in compare.OPTIONS.items()} | changes

@@ -104,6 +104,31 @@ def test_what_goes_wrong_with_a_logger_is_said_once(where, tmp_path, recorder, m
     assert list((tmp_path / "tensorboard").iterdir())
 
 
+def test_a_logger_that_fails_is_closed_and_told_what_it_missed_where_that_is_done_again(
+    tmp_path, recorder, monkeypatch
+):
+    def scalars(self, values, env_steps):
+        if env_steps > 20:
+            raise ConnectionError("the server is gone")
+        Recorder.scalars(self, values, env_steps)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recorder, "scalars", scalars)
+        log = metrics.RunLog(tmp_path, 0, _settings("wandb"), warn=lambda text: None)
+        for step in (10, 20, 30):
+            log.metrics([_line(step)])
+        log.close()
+        (first,) = recorder.made
+        for thread in first.threads:
+            thread.join(10)
+    log = metrics.RunLog(tmp_path, 10, _settings("wandb"), warn=pytest.fail)  # a kill undid what came after step 10
+    for step in (20, 30, 40):
+        log.metrics([_line(step)])
+    log.close()
+    assert first.closed
+    assert [step for made in recorder.made for step, _ in made.told] == [10, 20, 30, 40]
+
+
 def test_tensorboard_that_fails_does_not_stop_a_run_either(tmp_path, monkeypatch):
     monkeypatch.setattr(loggers.TensorBoard, "scalars", lambda *args: 1 / 0)
     said = []

@@ -166,6 +166,18 @@ def test_plans_are_diagnosed_as_far_as_they_can_be(tmp_path):
     assert (found["critics"], found["states"]) == (None, None)
 
 
+def test_members_and_checkpoints_share_a_compiled_policy(trained):
+    run, obs = runs.load(trained), np.zeros((1, 5), np.float32)
+    before = [program._cache_size() for program in (members._mean_action, members._evaluation_action)]
+    actions = []
+    for one in members.load_each(run):
+        for who in ("all", "best"):
+            actions += [np.asarray(act(obs)) for _, act in members.acting(one, who)]
+    after = [program._cache_size() for program in (members._mean_action, members._evaluation_action)]
+    assert len({action.tobytes() for action in actions}) > 4  # each acts for itself
+    assert np.subtract(after, before).max() <= 1
+
+
 # ── videos ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -250,6 +262,15 @@ def test_render_makes_a_video(trained, tmp_path):
 def test_a_strip_goes_from_the_first_frame_to_the_last():
     frames = [np.full((6, 8, 3), shade, np.uint8) for shade in range(10)]
     np.testing.assert_array_equal(render.strip(frames)[0, ::8, 0], [0, 3, 6, 9])
+
+
+def test_what_is_small_keeps_its_colour_in_a_gif(tmp_path):
+    frame = np.random.default_rng(0).integers(0, 90, (60, 80, 3)).astype(np.uint8)
+    frame[..., 2] += 90  # a restless blue
+    frame[30:34, 40:44] = 230, 165, 95
+    render._write([frame, frame], 0.04, tmp_path / "a.gif")
+    shown = np.asarray(Image.open(tmp_path / "a.gif").convert("RGB"), int)
+    assert np.abs(shown[30:34, 40:44] - (230, 165, 95)).max() < 20
 
 
 def test_a_mosaic_has_its_tiles_in_rows():

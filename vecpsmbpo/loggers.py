@@ -5,6 +5,7 @@ speak to a server do so on threads of their own, so that a connection that hangs
 server is theirs to know: WANDB_MODE, WANDB_PROJECT, MLFLOW_TRACKING_URI, MLFLOW_EXPERIMENT_NAME and so on.
 """
 
+import contextlib
 import dataclasses
 import importlib.util
 import logging
@@ -21,7 +22,7 @@ from vecpsmbpo.settings import SettingError, Settings
 
 PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
 PROJECT = "vecpsmbpo"  # W&B's project and MLflow's experiment, unless the environment names another
-TENSORBOARD, IDS = "tensorboard", "{}.id"  # in the run directory
+TENSORBOARD, IDS, SENT = "tensorboard", "{}.id", "{}.sent"  # in the run directory
 FILES = ("report.html", "*.mp4", "*.gif")  # of the run directory, that are sent when a session ends
 CLOSE_S = 60.0  # that a logger may take to say what it still has to say
 
@@ -64,14 +65,14 @@ class Loggers:
         """
         Args:
             env_steps: where the session begins.
-            sent: steps up to which the loggers of earlier sessions have been told everything. Work that a kill undid
-                is done again, and the same; servers cannot forget, so they are not told twice.
+            sent: steps up to which earlier sessions have logged everything. Work that a kill undid is done again, and
+                the same; servers cannot forget, so what has reached one it is not told twice.
         """
         self._run_dir = run_dir
         self._loggers: dict[str, Logger] = {}
         self._failed: set[str] = set()
         self._warn = warn
-        self._sent = {name: sent for name in settings.loggers if (run_dir / IDS.format(name)).exists()}
+        self._sent = {name: _reached(run_dir, name, sent) for name in settings.loggers}
         for name in settings.loggers:
             try:
                 self._loggers[name] = self._make(name, settings, env_steps)
@@ -82,11 +83,16 @@ class Loggers:
         if name == "tensorboard":
             return TensorBoard(self._run_dir, env_steps)
         kinds: dict[str, Callable[..., Logger]] = {"wandb": Wandb, "mlflow": Mlflow}
-        return Remote(lambda: kinds[name](settings, self._run_dir, env_steps), lambda error: self._drop(name, error))
+        path = self._run_dir / SENT.format(name)
+        return Remote(
+            lambda: kinds[name](settings, self._run_dir, env_steps),
+            lambda error: self._drop(name, error),
+            lambda env_steps: _store(path, str(env_steps)),
+        )
 
     def scalars(self, values: Values, env_steps: int) -> None:
         for name in self._loggers:
-            if env_steps > self._sent.get(name, 0):
+            if env_steps > self._sent[name]:
                 self._tell(name, "scalars", values, env_steps)
 
     def flush(self) -> None:
@@ -108,6 +114,9 @@ class Loggers:
             getattr(self._loggers[name], what)(*args)
         except Exception as error:  # as above
             self._drop(name, error)
+            if what != "close":
+                with contextlib.suppress(Exception):
+                    self._loggers[name].close()
 
     def _drop(self, name: str, error: Exception) -> None:
         if name in self._failed:
@@ -142,18 +151,28 @@ class TensorBoard:
 class Remote:
     """A logger on a thread of its own."""
 
-    def __init__(self, make: Callable[[], Logger], failed: Callable[[Exception], None]):
-        """`failed`: is told, on that thread, what went wrong; nothing is sent any more then."""
-        self._make, self._failed = make, failed
+    def __init__(self, make: Callable[[], Logger], failed: Callable[[Exception], None], reached: Callable[[int], None]):
+        """Both are called on that thread.
+
+        Args:
+            failed: is told what went wrong; nothing is sent any more then.
+            reached: is told the steps up to which the logger has taken everything.
+        """
+        self._make, self._failed, self._reached = make, failed, reached
+        self._env_steps = 0
         self._calls: queue.SimpleQueue[Callable[[Logger], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def scalars(self, values: Values, env_steps: int) -> None:
+        self._env_steps = env_steps
         self._calls.put(lambda logger: logger.scalars(values, env_steps))
 
     def flush(self) -> None:
+        env_steps = self._env_steps
         self._calls.put(lambda logger: logger.flush())
+        if env_steps:  # 0: all of this session so far had been said before
+            self._calls.put(lambda logger: self._reached(env_steps))
 
     def files(self, paths: Sequence[Path]) -> None:
         self._calls.put(lambda logger: logger.files(paths))
@@ -166,12 +185,16 @@ class Remote:
             raise TimeoutError(f"it did not answer for {CLOSE_S:g} s")
 
     def _work(self) -> None:
+        logger = None
         try:
             logger = self._make()
             while (call := self._calls.get()) is not None:
                 call(logger)
         except Exception as error:  # as in `Loggers`
-            self._failed(error)
+            self._failed(error)  # first: closing may take long
+            if logger is not None:
+                with contextlib.suppress(Exception):
+                    logger.close()
 
 
 class Wandb:
@@ -263,7 +286,19 @@ def _id(run_dir: Path, name: str, make: Callable[[], str]) -> str:
     """What the run is called at a logger's server: the same in every session."""
     path = run_dir / IDS.format(name)
     if not path.exists():
-        made, beside = make(), path.with_suffix(".tmp")
-        beside.write_text(made)
-        beside.replace(path)
+        _store(path, make())
     return path.read_text().strip()
+
+
+def _reached(run_dir: Path, name: str, logged: int) -> int:
+    """Steps up to which a logger has been told everything, of those that were `logged`; 0 for one that is new."""
+    if not (run_dir / IDS.format(name)).exists():
+        return 0
+    path = run_dir / SENT.format(name)
+    return min(logged, int(path.read_text())) if path.exists() else logged
+
+
+def _store(path: Path, text: str) -> None:
+    beside = path.with_name(f"{path.name}.tmp")
+    beside.write_text(text)
+    beside.replace(path)

@@ -222,18 +222,16 @@ def _shown(what: str, steps: Iterable[int]) -> Iterable[int]:
 
 def _members_act(trained: "Trained", each: int) -> Any:
     """Every member in `each` episodes of its own, acting as in training."""
-    import jax
+    from vecpsmbpo.look import diagnostics
 
     actor, actors = trained.nets.actor, trained.actors()
     count = trained.run.settings.n_members
 
-    @jax.jit
-    def sample(actors, obs, key):
-        keys = jax.random.split(key, count)
-        action, log_prob = jax.vmap(lambda params, obs, key: actor.law(params, obs).sample(key))(actors, obs, keys)
+    def act(step: int, obs: Array, key: Any) -> tuple[Any, Any]:
+        action, log_prob = diagnostics.sample(actors, obs.reshape(count, each, -1), key, actor=actor)
         return action.reshape(count * each, -1), log_prob.reshape(-1)
 
-    return lambda step, obs, key: sample(actors, obs.reshape(count, each, -1), key)
+    return act
 
 
 def _evaluation_act(trained: "Trained", each: int) -> Any:

@@ -205,6 +205,13 @@ def told(episodes: Episodes, discount: float) -> Array:
     return episodes.there & (whole | (discount**left <= TAIL))
 
 
+@partial(jax.jit, static_argnames="actor")
+def sample(actors: Params, obs: jax.Array, key: jax.Array, *, actor: networks.Actor) -> tuple[jax.Array, jax.Array]:
+    """Actions that each member draws, and their log-densities: actors [P, ...], obs [P, B, O] -> [P, B, A], [P, B]."""
+    keys = jax.random.split(key, len(obs))
+    return jax.vmap(lambda params, obs, key: actor.law(params, obs).sample(key))(actors, obs, keys)
+
+
 @partial(jax.jit, static_argnames="nets")
 def values(critics: Params, obs: jax.Array, action: jax.Array, *, nets: sac.Networks) -> jax.Array:
     """min(Q_1, Q_2) of each member: critics [P, ...], obs [P, B, O], action [P, B, A] -> [P, B]."""

@@ -95,8 +95,8 @@ def _model_panels(models: dict[str, Any]) -> Iterator[Panel]:
     )
     yield Panel(
         "error by dimension",
-        "the error of every coordinate of the observation and of the reward, in its standard deviations; mean over "
-        "models",
+        "the error of every coordinate of the observation and of the reward, in its standard deviations (darkest: one "
+        "or more, if any is); mean over models",
         lambda axes: _draw_dimensions(axes, models),
     )
     cells = zip(models["levels"], _array(models["coverage"]).mean(axis=(0, 2)), strict=True)
@@ -138,7 +138,9 @@ def _draw_dimensions(axes: Axes, models: dict[str, Any]) -> None:
     spread = _array(models["spread"])
     errors = _array(models["error"]).mean(axis=0) / np.where(spread > 0, spread, np.nan)
     names = models["dimensions"]
-    scale = LogNorm(0.01, 1, clip=True)
+    known = errors[np.isfinite(errors) & (errors > 0)]
+    most = min(1.0, known.max(initial=1e-2))  # beyond a standard deviation a model knows nothing
+    scale = LogNorm(min(max(known.min(initial=most), 1e-3 * most), 0.5 * most), most, clip=True)
     edges = np.arange(errors.shape[0] + 1) + 0.5
     rows = np.arange(len(names) + 1) - 0.5
     mesh = axes.pcolormesh(edges, rows, errors.T, cmap="viridis_r", norm=scale, rasterized=True)
@@ -147,7 +149,7 @@ def _draw_dimensions(axes: Axes, models: dict[str, Any]) -> None:
     axes.invert_yaxis()
     axes.grid(False)
     axes.set_xlabel("steps ahead")
-    bar = axes.figure.colorbar(mesh, ax=axes, pad=0.02, fraction=0.05, extend="both")
+    bar = axes.figure.colorbar(mesh, ax=axes, pad=0.02, fraction=0.05)
     bar.set_label("error, in standard deviations")
     bar.outline.set_visible(False)
 

@@ -49,9 +49,6 @@ class Experiment:
             words = [" ".join(f"{name}={value}" for name, value in point.items()) for point in self.missing[:3]]
             more = f" and {len(self.missing) - 3} more" if len(self.missing) > 3 else ""
             yield f"{self.name}: no run of {', '.join(words)}{more}; to make them: {self.command}"
-        for run in self.runs:
-            if not run.complete:
-                yield f"{run.path}: has come to step {run.env_steps:,} of {run.settings.total_steps:,}"
         yield from runs.warnings(self.runs)
 
 

@@ -220,8 +220,9 @@ def draw_weights(experiment: Experiment) -> "Figure":
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     first, whole, returns = figure.subplots(1, 3)
     end = lane.epochs["env_steps"][-1]
-    for axis, until in ((first, INITIAL * end), (whole, end)):
+    for axis, until, part in ((first, INITIAL * end, "first third"), (whole, end, "whole")):
         posterior.draw_weights(axis, lane, "env_steps", until=until)
+        axis.set_title(part, loc="right", fontsize=9)
         style.steps_axis(axis, AXES["env_steps"])
     look, sampled = style.looks(2)
     style.line(returns, look, lane.epochs["env_steps"], lane.epochs["eval_return"], label="evaluation")

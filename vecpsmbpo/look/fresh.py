@@ -1,7 +1,7 @@
 """Fresh episodes of the task that a run learned: what its models and critics are measured against."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -59,13 +59,19 @@ class World(Protocol):
     def step(self, action: Array) -> Step: ...
 
 
+@lru_cache(maxsize=1)
+def _programs(env: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Reset and step of a batch of an environment, compiled once for all worlds of it."""
+    return jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+
+
 class MjxWorld:
     """MJX environments. One whose episode is over goes on: nobody looks at it any more."""
 
     def __init__(self, env: Any, count: int, seed: int):
         self._seed, self._count = seed, count
         self.rewind()
-        self._reset, self._step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+        self._reset, self._step = _programs(env)
         self.state: Any = None  # leaves [E, ...]
 
     def rewind(self) -> None:

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import imagination, posterior, replay, sac
+from vecpsmbpo import imagination, networks, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.pets.settings import PetsSettings
 from vecpsmbpo.algorithms.ps_mbpo.algorithm import PsMbpo
@@ -157,8 +158,7 @@ def acting(trained: Trained, member: str) -> list[tuple[str, Act]]:
     actor, actors = trained.nets.actor, trained.actors()
 
     def policy(index: int) -> Act:
-        params = jax.tree.map(lambda x: x[index], actors)
-        return jax.jit(lambda obs: actor.law(params, obs).mode())
+        return partial(_mean_action, jax.tree.map(lambda x: x[index], actors), actor=actor)
 
     return [(name, policy(index)) for index, name in enumerate(names) if member in ("all", name)]
 
@@ -167,6 +167,20 @@ def member_names(run: Run) -> list[str]:
     """`n,m` of every member, as `member=` takes them; `0,m` where policies belong to no model."""
     m = run.settings.policies_per_model
     return [f"{index // m},{index % m}" for index in range(run.settings.n_members)]
+
+
+# Compiled once for all members and checkpoints, whose parameters are arguments.
+
+
+@partial(jax.jit, static_argnames="actor")
+def _mean_action(params: Any, obs: Any, *, actor: networks.Actor) -> jax.Array:
+    return actor.law(params, obs).mode()
+
+
+@partial(jax.jit, static_argnames="algorithm")
+def _evaluation_action(policy: Any, obs: Any, *, algorithm: Algorithm) -> jax.Array:
+    step, key = jnp.int32(0), jax.random.key(0)  # a policy, unlike a plan, needs neither
+    return algorithm.evaluation_action(policy, step, algorithm.memory(), obs, key)[0]
 
 
 def _evaluated(trained: Trained, who: str) -> Act:
@@ -179,5 +193,4 @@ def _evaluated(trained: Trained, who: str) -> Act:
         return jax.jit(lambda obs: jax.vmap(lambda params: actor.law(params, obs).mode())(actors).mean(axis=0))
     algorithm = replace(trained.algorithm, settings=settings)
     chosen = trained.of_lane(evaluation_policies(algorithm)(trained.state, trained.state.key))
-    step, key = jnp.int32(0), jax.random.key(0)  # a policy, unlike a plan, needs neither
-    return jax.jit(lambda obs: algorithm.evaluation_action(chosen, step, algorithm.memory(), obs, key)[0])
+    return partial(_evaluation_action, chosen, algorithm=algorithm)

@@ -45,8 +45,8 @@ table { border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabu
 th, td { padding: 4px 12px 4px 0; text-align: right; border-bottom: 1px solid var(--edge); white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; padding-left: 10px; }
 th { font-weight: 600; color: var(--soft); }
-pre { background: var(--card); border: 1px solid var(--edge); border-radius: 8px; padding: 10px 14px; overflow-x: auto;
-  font-size: .84rem; }
+pre { background: var(--card); border: 1px solid var(--edge); border-radius: 8px; padding: 10px 14px; font-size: .84rem;
+  white-space: pre-wrap; overflow-wrap: anywhere; }
 details { margin: 12px 0; }
 summary { cursor: pointer; color: var(--accent); padding: 6px 0; }
 @media (prefers-color-scheme: dark) {

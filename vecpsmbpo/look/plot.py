@@ -73,6 +73,8 @@ def draw(found: list[runs.Run], options: dict[str, Any]) -> None:
         figure, axes = style.grid(len(panels), COLUMNS, (5.6, 3.6) if len(panels) == 1 else (4.4, 3.1))
         looks = style.looks_of([one.name for one in together], ordered=is_ordered(together))
         for axis, y, curves in zip(axes, options["y"], panels, strict=True):
+            if len(curves) == 1:  # several groups of seeds would be a thicket
+                style.threads(axis, looks[curves[0].name], curves[0].x, curves[0].seeds)
             draw_curves(axis, curves, looks)
             axis.set_ylabel(AXES.get(y, y))
             style.steps_axis(axis, AXES[options["x"]])

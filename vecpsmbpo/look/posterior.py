@@ -96,9 +96,10 @@ def _draw_returns(axes: Axes, episodes: Columns, acts: Array) -> None:
     if len(index) > 4 * BINS:
         _draw_spread(axes, index, earned)
     else:
+        dots: dict[str, Any] = {"s": 14, "clip_on": False}  # the last episode's lies on the edge
         alone: dict[str, Any] = {"facecolors": "none", "edgecolors": style.FAINT, "lw": 0.7}
-        axes.scatter(index[~credited], earned[~credited], s=14, label="random, or by all", **alone)
-        axes.scatter(index[credited], earned[credited], s=14, label="by a member", color=style.COLOURS[1], lw=0)
+        axes.scatter(index[~credited], earned[~credited], label="random, or by all", **dots, **alone)
+        axes.scatter(index[credited], earned[credited], label="by a member", color=style.COLOURS[1], lw=0, **dots)
     axes.set_xlabel("episode")
     axes.set_ylabel("return")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))

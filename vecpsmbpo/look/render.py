@@ -209,7 +209,9 @@ def _write(frames: list[Array], frame_s: float, path: Path) -> None:
     if kind == ".png":
         Image.fromarray(strip(frames)).save(path)
     elif kind == ".gif":
-        first, *others = [Image.fromarray(frame).quantize(128) for frame in frames]
+        # The usual choice of colours, by how many pixels have them, turns what is small and bright grey.
+        colours = Image.Quantize.MAXCOVERAGE
+        first, *others = [Image.fromarray(frame).quantize(128, method=colours) for frame in frames]
         first.save(path, save_all=True, append_images=others, duration=round(1000 * frame_s), loop=0)
     else:
         import imageio

@@ -32,7 +32,7 @@ OPTIONS = {
 PAGE = "report.html"  # in the directory of a run with report=true
 REFRESH_S = 30  # after which a browser looks for a newer one, while the run goes on
 WINDOW = 5  # epochs that count as the last ones
-PICTURED = 4  # lanes whose posterior is drawn at once; the others are there to be opened
+PICTURED = 3  # a row of them: lanes whose posterior is drawn at once; the others are there to be opened
 SHOWN = 60  # rows of the table of epochs
 
 # What is drawn of the inside of a run: the column, what it says, and whether it spans powers of ten.
@@ -176,10 +176,10 @@ def _add_run(page: "Page", run: Run, heading: str, diagnosis: dict[str, Any] | N
     page.add(f"<{heading}>{escape(settings.task)}, {escape(algo)}</{heading}>", _state(run))
     page.add(html.tiles(_tiles(run)))
     page.add(html.panels(filter(None, (_lanes_picture(page, run, y) for y in ("eval_return", "train_return")))))
-    _add_posterior(page, run)
-    pictures = [_lanes_picture(page, run, y, caption, log=log) for y, caption, log in INSIDE]
     if max(len(one.lanes) for one in groups.group([run])) > 1:
         page.add('<p class="soft">Thick lines are means over seeds, thin ones the seeds.</p>')
+    _add_posterior(page, run)
+    pictures = [_lanes_picture(page, run, y, caption, log=log) for y, caption, log in INSIDE]
     page.add("<h3>Inside</h3>", html.panels(filter(None, (*pictures, _chances_picture(page, run)))))
     if diagnosis is not None:
         _add_diagnosis(page, diagnosis)
@@ -223,8 +223,9 @@ def _tiles(run: Run) -> list[tuple[str, str]]:
     last = [compare.score(lane, run.env_steps, _scoring()) for lane in run.lanes]
     final = statistics.bootstrap(statistics.interquartile_mean, [np.array([seed.final for seed in last])])
     best = statistics.Estimate(max(seed.best for seed in last), np.nan, np.nan)
+    interval = "" if np.isnan(final.low) else ", and 95% interval"
     tiles = [
-        (compare.shown(final), f"evaluation return, last {WINDOW} epochs"),
+        (compare.shown(final), f"evaluation return, last {WINDOW} epochs{interval}"),
         (compare.shown(best), "best evaluation"),
     ]
     if seconds := _known(run, "seconds"):
@@ -262,8 +263,7 @@ def _lanes_picture(page: "Page", run: Run, y: str, caption: str = "", *, log: bo
     figure, (axes,) = style.grid(1, 1, (4.4, 2.9))
     looks = style.looks(len(curves), ordered=plot.is_ordered(together))
     for look, line in zip(looks, curves, strict=True):
-        if len(line.seeds) > 1:
-            axes.plot(line.x, line.seeds.T, color=look.colour, lw=0.7, alpha=0.45)
+        style.threads(axes, look, line.x, line.seeds)
         style.line(axes, look, line.x, line.y, label=line.name)
     if y == "real_ratio":
         axes.set_ylim(-0.03, 1.03)

@@ -157,6 +157,8 @@ def warnings(runs: Iterable[Run]) -> Iterator[str]:
     for run in runs:
         if run.metrics.damaged:
             yield f"{run.path / METRICS_FILE}: {run.metrics.damaged} damaged line(s) left out"
+        if not run.complete:
+            yield f"{run.path}: has come to step {run.env_steps:,} of {run.settings.total_steps:,}"
         for lane in run.lanes:
             if lane.frozen:
                 yield f"{run.path}: {lane.name} was frozen at step {lane.epochs['env_steps'][-1]:.0f}"

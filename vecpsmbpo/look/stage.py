@@ -70,7 +70,7 @@ class MjxStage:
     def __init__(self, settings: Settings, width: int, seed: int):
         from vecpsmbpo.look import fresh
 
-        env = envs.make(settings.env, "mjx", **dict(settings.env_options))
+        env = _jax_env(settings.env, settings.env_options)
         self._world = fresh.MjxWorld(env, 1, seed)
         self._scene = scene(env)
         self.dt, self.episode_length = self._scene.dt, env.spec.episode_length
@@ -84,6 +84,12 @@ class MjxStage:
 
     def picture(self) -> Array:
         return self._draw(self._world.state)
+
+
+@functools.lru_cache(maxsize=1)
+def _jax_env(name: str, options: tuple[tuple[str, Any], ...]) -> Any:
+    """One for all stages of a task, and with it one compiled program."""
+    return envs.make(name, "mjx", **dict(options))
 
 
 class Scene:

@@ -112,6 +112,12 @@ def line(axes: Axes, look: Look, x: Array, y: Array, *, low: Array | None = None
         axes.fill_between(x, low, high, color=look.colour, alpha=0.16, lw=0)
 
 
+def threads(axes: Axes, look: Look, x: Array, seeds: Array) -> None:
+    """The seeds [S, T] that a line is the average of, thin; nothing where there is one."""
+    if len(seeds) > 1:
+        axes.plot(x, seeds.T, color=look.colour, lw=0.7, alpha=0.45)
+
+
 def steps_axis(axes: Axes, name: str) -> None:
     """Thousands as 5k, whole steps, no more ticks than fit a phone."""
     axes.set_xlabel(name)
