@@ -178,6 +178,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 
 
 def signals(folder: Path, options: dict) -> Iterator[Found]:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # a run inherits what nohup makes of it, and heeds that
     reference = undisturbed(folder, "host")
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         name = signal.Signals(number).name
