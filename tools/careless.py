@@ -18,7 +18,6 @@ SETTINGS = [
         "sweep=3",
         "+new=1",
         "a b c",
-        "seed=0 seed=1",
     ),
     *(
         "run_dir=${nosuch}",

@@ -112,7 +112,7 @@ def undisturbed(folder: Path, backend: str) -> Path:
 def careless(folder: Path, options: dict) -> Iterator[Found]:
     for name, code in MODULES.items():
         (folder / f"{name}.py").write_text(code)
-    before = contents(folder)
+    before = {path.name for path in folder.iterdir()}
     for words, surroundings in COMMANDS:
         surrounded = {**environment(), **surroundings, "PYTHONDONTWRITEBYTECODE": "1"}
         program = [sys.executable, "-m", "vecpsmbpo.cli", *words]
@@ -123,9 +123,11 @@ def careless(folder: Path, options: dict) -> Iterator[Found]:
             ended = one_line(result.returncode, result.stderr)
         except subprocess.TimeoutExpired:
             ended = f"no answer within {ANSWER_S} s"
-        left = contents(folder).keys() - before.keys()
+        for left in {path.name for path in folder.iterdir()} - before:
+            ended = f"left {left}"
+            shutil.rmtree(folder / left)
         set_as = "".join(f"{name}={value} " for name, value in surroundings.items())
-        yield f"{set_as}{' '.join(words)}"[:80], f"left {sorted(left)}" if left else ended
+        yield f"{set_as}{' '.join(words)}"[:80], ended
 
 
 def files(folder: Path, options: dict) -> Iterator[Found]:
@@ -176,6 +178,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 
 
 def signals(folder: Path, options: dict) -> Iterator[Found]:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # a run inherits what nohup makes of it, and heeds that
     reference = undisturbed(folder, "host")
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         name = signal.Signals(number).name
@@ -255,7 +258,7 @@ def main(arguments: list[str]) -> int:
             for what, ended in PARTS[name](Path(folder).resolve(), options):
                 print(f"{name}: {what}: {ended}", flush=True)
                 rows.append({"part": name, "what": what, "ended": ended})
-        keep(name, rows)
+                keep(name, rows)  # at once: a part that is stopped has told what it found
         bad += sum(row["ended"] not in FINE for row in rows)
         print(f"{name}: {len(rows)} tried, {sum(row['ended'] not in FINE for row in rows)} faults", flush=True)
     return int(bad > 0)

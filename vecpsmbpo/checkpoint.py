@@ -55,9 +55,8 @@ class Checkpoints:
         self._directory, self._settings = directory, settings
         self._format = TABLE[settings.algo].format
         self._damaged: list[int] = []
-        for name in ("absl", "orbax"):
-            logging.getLogger(name).setLevel(logging.ERROR)
-        logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # of every file that cannot be read, beside the error
+        for name in ("absl", "orbax", "asyncio"):  # which tell of every file that cannot be read, beside the error
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep,
             enable_async_checkpointing=False,
