@@ -89,7 +89,7 @@ class Checkpoints:
         plain = _to_host(state, layout)
         chunks = jax.tree.map(lambda _: ocp.SaveArgs(chunk_byte_size=CHUNK_BYTES), plain)
         about = {
-            "format": TABLE[self._settings.algo].format,
+            "format": self._format,
             "settings": recorded.plain(self._settings),
             "arrays": _arrays_sum(plain),
         }
