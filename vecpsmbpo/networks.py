@@ -68,7 +68,7 @@ def layer_norm(x: jax.Array) -> jax.Array:
     """Each row of x [..., H] at mean 0 and variance 1 (Ba et al., 2016).
 
     Without gain and offset, which the dense layers around it have, and written out: XLA's code for a CPU then costs a
-    third of flax's `LayerNorm` beside products of 64 columns (docs/results.md).
+    third of flax's `LayerNorm` beside products of 64 columns (docs/lab_notes.md).
     """
     return rms_norm(x - jnp.mean(x, axis=-1, keepdims=True))
 
