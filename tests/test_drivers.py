@@ -11,6 +11,7 @@ import pytest
 from tests import probes
 from tests.helpers import algorithm, assert_probabilities_follow, tiny
 from vecpsmbpo import metrics, replay, sac
+from vecpsmbpo.algorithms.catalogue import of_algorithm
 from vecpsmbpo.drivers import HostDriver, ScanDriver
 from vecpsmbpo.drivers.common import split_for_episodes
 from vecpsmbpo.training.programs import evaluation_keys, initial_inputs
@@ -40,7 +41,8 @@ def settings_for(**changes):
         "discount": DISCOUNT,
         "target_entropy": -20.0,
     }
-    return tiny(**{**chosen, **changes})
+    has = of_algorithm(changes.get("algo", "ops_mbpo"))
+    return tiny(**{**{name: value for name, value in chosen.items() if name in has}, **changes})
 
 
 def make_driver(kind, terminates, settings):
@@ -190,7 +192,8 @@ def test_only_real_data_needs_no_models():
 
 @pytest.mark.parametrize("algo", ["ops_mbpo", "pets", "slbo"])
 def test_seeds_differ_and_are_what_they_are_alone(algo):
-    settings = settings_for(updates_per_step=1, num_seeds=2, algo=algo, plan_hold=1)
+    own = {"pets": {"plan_hold": 1}, "ops_mbpo": {"updates_per_step": 1}}.get(algo, {})
+    settings = settings_for(num_seeds=2, algo=algo, **own)
     driver = make_driver("scan", True, settings)
     state, news = driver.run(driver.init(*initial_inputs(settings)), 200 // settings.stride)
     actions = np.asarray(state.seeds.real[:, :200, 1])

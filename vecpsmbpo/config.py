@@ -106,6 +106,18 @@ def _check_env_options(found: dict[str, Any]) -> None:
             raise SettingError(f"{name}: no such option of env={env}; it has {has}")
 
 
+def _check_values(env: str, options: Mapping[str, Any]) -> None:
+    """That the options of a task have the types of their defaults; one that must be given is a name."""
+    for name, default in env_options(env).items():
+        value = options.get(name, default)
+        if isinstance(default, str):
+            wrong, what = not isinstance(value, str) or not value, "a name"
+        else:
+            wrong, what = isinstance(value, bool) or not isinstance(value, int | float), "a number"
+        if wrong:
+            raise SettingError(f"env.{name}={value}: must be {what}")
+
+
 def _check_algorithm(algo: str, names: Iterable[str]) -> None:
     """That the algorithm has the settings given."""
     for name in names:
@@ -186,6 +198,7 @@ def from_tree(tree: DictConfig, overrides: Sequence[str]) -> Settings:
     for name, value in values["env_options"].items():
         if value == "???":
             raise SettingError(f"env.{name}: must be given with env={values['env']}")
+    _check_values(values["env"], values["env_options"])
     values["backend"] = registry.resolve_backend(values["env"], check("backend", values["backend"]))
     settings = build(values)
     if not settings.run_dir:
@@ -227,6 +240,7 @@ def load(run_dir: str | Path) -> Settings:
         values = {**_defaults(stored["algo"]), "recipe": "paper", **stored}
         for group in ("env", "algo"):
             _check_override(group, values[group])
+        _check_values(values["env"], dict(values.get("env_options", ())))
         return dataclasses.replace(build(values), run_dir=str(run_dir))
     except OSError:
         raise SettingError(f"run_dir={run_dir}: holds no {CONFIG_FILE}, so no run") from None

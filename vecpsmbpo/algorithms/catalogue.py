@@ -72,9 +72,6 @@ def build(values: Mapping[str, Any]) -> Settings:
         SettingError: a value is wrong, or two contradict.
     """
     options = tuple(sorted(dict(values.get("env_options", ())).items()))
-    for name, value in options:
-        if not isinstance(value, str) or not value:
-            raise SettingError(f"env.{name}={value}: must be a name")
     sweep = tuple((name, check_sweep(name, swept)) for name, swept in sorted(dict(values.get("sweep", ())).items()))
     if (algo := values["algo"]) not in TABLE:
         raise SettingError(f"algo={algo}: must be one of {', '.join(TABLE)}")
