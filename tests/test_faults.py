@@ -54,7 +54,7 @@ def test_a_careless_command_is_one_line(arguments, line, tmp_path, monkeypatch, 
 
 def test_a_default_run_directory_of_many_overrides_has_a_name_that_fits():
     many = [f"{name}=0.{'1' * 15}" for name in ("real_ratio", "temperature", "discount", "target_entropy")]
-    many += [f"{name}=0.{'1' * 15}" for name in ("policy_learning_rate", "model_learning_rate", "gae_decay")]
+    many += [f"{name}=0.{'1' * 15}" for name in ("policy_learning_rate", "model_learning_rate", "target_update_rate")]
     names = {config.compose([*many, f"model_weight_decay={value}"]).run_dir for value in (0.1, 0.2)}
     assert len(names) == 2
     assert all(len(name) < 255 for name in names)
@@ -178,9 +178,13 @@ def test_what_the_system_refuses_is_one_line(monkeypatch, capsys):
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
 def test_signals_that_ask_a_run_to_stop(number, capfd):
-    with guards.heeding_signals() as stop:
-        os.kill(os.getpid(), number)
-        assert stop.requested == number
+    before = signal.signal(number, signal.SIG_DFL)  # also where the tests run under nohup
+    try:
+        with guards.heeding_signals() as stop:
+            os.kill(os.getpid(), number)
+            assert stop.requested == number
+    finally:
+        signal.signal(number, before)
     assert "finishing this chunk and saving" in capfd.readouterr().err
 
 

@@ -68,18 +68,18 @@ def test_a_step_written_twice_counts_once(tmp_path):
 
 
 def test_reading_is_linear(tmp_path):
-    """Four times the lines take less than eight times as long, and are arrays: 8 bytes a number, 4 a probability."""
+    """Four times the lines take less than twelve times as much of a core (a square law: sixteen), and are arrays: 8 bytes a number, 4 a probability."""
     seconds = []
     for count in (20_000, 80_000):
         lines = looks.episodes(100)
         text = "".join(json.dumps(line) + "\n" for line in lines) * (count // 100)
         (tmp_path / "episodes.jsonl").write_text(text)
-        began = time.perf_counter()
+        began = time.process_time()  # not what other programs take
         log = runs.read(tmp_path / "episodes.jsonl")
-        seconds.append(time.perf_counter() - began)
+        seconds.append(time.process_time() - began)
         assert len(log) == count
         assert sum(column.nbytes for column in log.columns.values()) == count * (8 * (len(lines[0]) - 1) + 4 * 4)
-    assert seconds[1] < 8 * seconds[0]
+    assert seconds[1] < 12 * seconds[0]
 
 
 # ── grouping ────────────────────────────────────────────────────────────────────────────────────────────────────────

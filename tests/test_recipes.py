@@ -25,7 +25,7 @@ OFF = {
 @pytest.mark.parametrize("env", list(registry.TASKS))
 @pytest.mark.parametrize("size", ["tiny", "cpu", "paper"])
 def test_the_paper_s_recipe_has_no_stabiliser_at_any_size(env, size):
-    options = [f"env.{name}=x" for name in config.env_options(env)]
+    options = [f"env.{name}=x" for name, value in config.env_options(env).items() if value == "???"]
     settings = config.compose([f"env={env}", f"size={size}", "recipe=paper", *options])
     assert {name: getattr(settings, name) for name in OFF} == OFF
     assert settings.recipe == "paper"

@@ -129,9 +129,10 @@ class _Probe:
         self._each = episodes
         spec = trained.algorithm.spec
         self._length = settings.episode_length or spec.episode_length
-        self._discount = float(trained.of_lane(trained.state.hyper.discount))
-        # A time limit is no part of the task: critics are asked about what lies beyond it, too.
-        self._steps = self._length + (diagnostics.tail(self._discount) if trained.has_members else 0)
+        self._steps = self._length
+        if trained.has_members:  # who have critics; a time limit is no part of the task, nor of what these are asked
+            self._discount = float(trained.of_lane(trained.state.hyper.discount))
+            self._steps += diagnostics.tail(self._discount)
         members = settings.n_members if trained.has_members else 1
         self._world = fresh.world(settings, members * episodes, self._steps, seed)
 
