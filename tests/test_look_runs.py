@@ -68,8 +68,8 @@ def test_a_step_written_twice_counts_once(tmp_path):
 
 
 def test_reading_is_linear(tmp_path):
-    """Four times the lines take less than twelve times as long (a square law: sixteen), and are arrays: 8 bytes a number,
-    4 a probability."""
+    """Four times the lines take less than twelve times as long (a square law: sixteen), and are arrays: 8 bytes a
+    number, 4 a probability."""
     seconds = []
     for count in (20_000, 80_000):
         lines = looks.episodes(100)
