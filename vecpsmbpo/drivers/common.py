@@ -1,8 +1,8 @@
 """What both drivers share, apart from the order in which an algorithm's functions are called (`schedule`).
 
-A chunk is a number of strides, a few steps each, decided when the program is called: one
-compiled program serves chunks of any length, and how a run is cut into chunks does not change it. A stride is also what
-is undone in a lane where something stops being finite (`health`): its news are none.
+A chunk is a number of strides, a few steps each, decided when the program is called: one compiled program serves chunks
+of any length, and how a run is cut into chunks does not change it. A stride is also what is undone in a lane where
+something stops being finite (`health`): its news are none.
 """
 
 import time
