@@ -19,6 +19,7 @@ OFF = {
     "clip_targets": False,
     "bound_log_prob": False,
     "target_update_every": 1,
+    "policy_learning_rate_decay": 1.0,
 }
 
 

@@ -88,6 +88,18 @@ def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> Agent:
     )
 
 
+def learning_rate(settings: SacSettings, first: jax.Array, env_steps: jax.Array) -> jax.Array:
+    """[] what Adam steps with after `env_steps`: from `first` on a line to the share `policy_learning_rate_decay` of it.
+
+    Large steps find a policy, and small ones tell apart actions whose values differ by less than the noise that large
+    steps leave in the critics. The line's end is a setting of its own, so that a run can be prolonged.
+    """
+    if settings.policy_learning_rate_decay == 1:
+        return first
+    progress = jnp.minimum(env_steps / settings.policy_learning_rate_decay_steps, 1.0)
+    return first * (1 - (1 - settings.policy_learning_rate_decay) * progress)
+
+
 def target_value(
     reward: jax.Array, terminated: jax.Array, next_q: jax.Array, next_log_prob: jax.Array, alpha, discount
 ) -> jax.Array:

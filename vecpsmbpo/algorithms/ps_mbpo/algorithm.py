@@ -238,6 +238,8 @@ class PsMbpo(Algorithm):
 
         moments = state.moments
         limits = sac.Limits(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
+        rate = sac.learning_rate(settings, state.hyper.policy_learning_rate, counters.env_steps)
+        hyper = state.hyper.replace(policy_learning_rate=rate)
 
         def update(agent, batches, noise, hyper, limits):
             every = settings.target_update_every
@@ -245,7 +247,7 @@ class PsMbpo(Algorithm):
                 agent, batches, noise, hyper, nets=nets, limits=limits, target_every=every, mean=layout.mean_of_parts
             )
 
-        return layout.map_local(update, state.agents, batches, noise, shared=(state.hyper, limits))
+        return layout.map_local(update, state.agents, batches, noise, shared=(hyper, limits))
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings
