@@ -1,6 +1,7 @@
 """Measures the program against the machine, as ratios within one run.
 
     python tools/bench.py updates     SAC updates inside the real program, against the float32 matrix-product peak
+    python tools/bench.py pieces      what XLA makes of one SAC update: products, fusions and copies inside the loop
     python tools/bench.py capacity    cost of a step at a large and at a small replay capacity
     python tools/bench.py program     cost of a step of the whole program, against its SAC updates alone
     python tools/bench.py envs        steps per second and compile seconds of every task, on each backend and batch size
@@ -11,6 +12,7 @@ Further arguments are settings, as for `vecpsmbpo train` (of `envs`: tasks). One
 
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -22,13 +24,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import config, envs, runtime
+from vecpsmbpo import config, envs, replay, runtime, sac
 from vecpsmbpo.drivers import ScanDriver
-from vecpsmbpo.envs import registry
+from vecpsmbpo.envs import registry, specs
 from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.training.programs import initial_inputs, make_driver
-from vecpsmbpo.types import TrainState
+from vecpsmbpo.types import Hyper, TrainState
 
 PAPER = [
     "env=hopper",
@@ -143,6 +145,38 @@ def bench_updates() -> dict[str, Any]:
     }
 
 
+def bench_pieces() -> dict[str, Any]:
+    return pieces_of_update(config.compose([*PAPER, *sys.argv[2:]]))
+
+
+def pieces_of_update(settings: Settings) -> dict[str, int]:
+    """How many instructions of each kind the compiled loop over G updates of one member has in its body."""
+    spec = specs.get(settings.env)
+    nets, hyper, key = sac.make_networks(settings, spec), Hyper.of(settings), jax.random.key(0)
+    shape = (settings.updates_per_step, settings.policy_batch_size)
+    ring = replay.init(2, spec.obs_size, spec.action_size)
+    batches = replay.unpack(ring[jnp.zeros(shape, int)], spec.obs_size, spec.action_size)
+    noise = sac.Noise.draw(key, (*shape, spec.action_size))
+    run = jax.jit(lambda agent: sac.updates(agent, batches, noise, hyper, nets=nets))
+    return loop_pieces(run.lower(sac.init(key, nets, spec)).compile().as_text())
+
+
+def loop_pieces(program: str) -> dict[str, int]:
+    """Of an XLA program in its text form: what is in the bodies of its loops, and in all that these call."""
+    computations = dict(re.findall(r"^(?:ENTRY )?%?([\w.\-]+) \([^\n]*\{\n(.*?)^\}", program, re.M | re.S))
+    seen: set[str] = set()
+    waiting = re.findall(r" while\(.*body=%?([\w.\-]+)", program)
+    while waiting:
+        name = waiting.pop()
+        if name not in seen:
+            seen.add(name)
+            called = r"(?:calls|to_apply|body|condition)=%?([\w.\-]+)"
+            waiting += re.findall(called, computations[name])
+    body = "".join(computations[name] for name in seen)
+    kinds = {"products": r"(?:dot|custom-call)", "fusions": "fusion", "copies": "copy"}
+    return {kind: len(re.findall(rf" {name}\(", body)) for kind, name in kinds.items()}
+
+
 def bench_capacity() -> dict[str, Any]:
     drivers = {
         size: driver_of([*SMALL, f"replay_capacity={size}", f"imagined_capacity={size}"])
@@ -248,6 +282,7 @@ BENCHES = {
     "envs": bench_envs,
     "host": bench_host,
     "updates": bench_updates,
+    "pieces": bench_pieces,
     "capacity": bench_capacity,
     "program": bench_program,
 }

@@ -56,6 +56,7 @@ def network(settings: Settings, spec: EnvSpec) -> networks.GaussianMLP:
         hidden_size=settings.model_hidden_size,
         hidden_layers=settings.model_hidden_layers,
         predicts_termination=spec.terminated is None,
+        precision=settings.network_precision,
     )
 
 

@@ -1,6 +1,7 @@
 """The networks: dynamics (A.1), SAC's actor and twin critic (A.2)."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +13,38 @@ from vecpsmbpo.types import Params
 MIN_LOG_VARIANCE, MAX_LOG_VARIANCE = -10.0, 2.0
 MIN_SCALE = 1e-3  # Acme's floor under the standard deviation of the policy
 LOG_PROB_BOUND = 3.8  # arctanh(0.999), where Acme's log-densities of a tanh stop to grow
+
+
+class Precision(NamedTuple):
+    """Of the hidden layers. Parameters are float32 always, and so is the last layer: a critic whose values of 100 are
+    half a unit apart, as bfloat16 has them, cannot tell actions apart.
+
+    Attributes:
+        dtype: of activations and of what is multiplied.
+        products: of their products, as XLA knows it; None is what the device does.
+    """
+
+    dtype: Any
+    products: Any
+
+
+PRECISIONS = {
+    "default": Precision(jnp.float32, None),
+    "float32": Precision(jnp.float32, jax.lax.Precision.HIGHEST),
+    "bfloat16": Precision(jnp.bfloat16, None),
+}
+
+
+def hidden_layer(size: int, kernel_init: Any, precision: str) -> nn.Dense:
+    """A dense layer of `size` outputs, of a `PRECISIONS` name."""
+    dtype, products = PRECISIONS[precision]
+    return nn.Dense(size, dtype=dtype, precision=products, kernel_init=kernel_init)
+
+
+def last_layer(size: int, kernel_init: Any, precision: str) -> nn.Dense:
+    """As `hidden_layer`, of float32 whatever the precision."""
+    return nn.Dense(size, dtype=jnp.float32, precision=PRECISIONS[precision].products, kernel_init=kernel_init)
+
 
 model_init = nn.initializers.variance_scaling(1.0, "fan_in", "truncated_normal")
 policy_init = nn.initializers.variance_scaling(1.0, "fan_in", "uniform")
@@ -35,20 +68,22 @@ class GaussianMLP(nn.Module):
 
     Attributes:
         predicts_termination: one more output, for tasks whose termination rule is not known.
+        precision: a name in `PRECISIONS`.
     """
 
     output_size: int
     hidden_size: int
     hidden_layers: int
     predicts_termination: bool = False
+    precision: str = "default"
 
     @nn.compact
     def outputs(self, inputs: jax.Array) -> jax.Array:
         """f_θ: inputs [..., O + A], whitened, to what the prediction is made of."""
         hidden = inputs
         for _ in range(self.hidden_layers):
-            hidden = nn.swish(nn.Dense(self.hidden_size, kernel_init=model_init)(hidden))
-        return nn.Dense(2 * self.output_size + self.predicts_termination, kernel_init=model_init)(hidden)
+            hidden = nn.swish(hidden_layer(self.hidden_size, model_init, self.precision)(hidden))
+        return last_layer(2 * self.output_size + self.predicts_termination, model_init, self.precision)(hidden)
 
     def __call__(self, inputs: jax.Array, scale: Any = 1.0, prior: Any = 0.0) -> Prediction:
         """The prediction of f_θ + prior, whose outputs are in units of `scale` [O + 1].
@@ -70,12 +105,14 @@ def layer_norm(x: jax.Array) -> jax.Array:
     Without gain and offset, which the dense layers around it have, and written out: XLA's code for a CPU then costs a
     third of flax's `LayerNorm` beside products of 64 columns (docs/lab_notes.md).
     """
-    return rms_norm(x - jnp.mean(x, axis=-1, keepdims=True))
+    exact = x.astype(jnp.float32)
+    return rms_norm(exact - jnp.mean(exact, axis=-1, keepdims=True)).astype(x.dtype)
 
 
 def rms_norm(x: jax.Array) -> jax.Array:
     """Each row of x [..., H] at mean square 1 (Zhang and Sennrich, 2019)."""
-    return x * jax.lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + 1e-6)
+    squares = jnp.square(x.astype(jnp.float32))
+    return x * jax.lax.rsqrt(jnp.mean(squares, axis=-1, keepdims=True) + 1e-6).astype(x.dtype)
 
 
 NORMS: dict[str, Callable[[jax.Array], jax.Array]] = {"none": lambda x: x, "layer": layer_norm, "rms": rms_norm}
@@ -86,18 +123,21 @@ class ReluMLP(nn.Module):
 
     Attributes:
         norm: of what goes into each ReLU, a name in `NORMS`.
+        precision: a name in `PRECISIONS`.
     """
 
     output_size: int
     hidden_size: int
     hidden_layers: int
     norm: str = "none"
+    precision: str = "default"
 
     @nn.compact
     def __call__(self, hidden: jax.Array) -> jax.Array:
         for _ in range(self.hidden_layers):
-            hidden = nn.relu(NORMS[self.norm](nn.Dense(self.hidden_size, kernel_init=policy_init)(hidden)))
-        return nn.Dense(self.output_size, kernel_init=policy_init)(hidden)
+            layer = hidden_layer(self.hidden_size, policy_init, self.precision)
+            hidden = nn.relu(NORMS[self.norm](layer(hidden)))
+        return last_layer(self.output_size, policy_init, self.precision)(hidden)
 
 
 class TanhGaussian(NamedTuple):
@@ -135,17 +175,20 @@ class Actor(nn.Module):
 
     Attributes:
         most: see `TanhGaussian`.
+        precision: a name in `PRECISIONS`.
     """
 
     action_size: int
     hidden_size: int
     hidden_layers: int
     most: float = float("inf")
+    precision: str = "default"
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> TanhGaussian:
         """obs [..., O] -> law of actions [..., A]."""
-        outputs = ReluMLP(2 * self.action_size, self.hidden_size, self.hidden_layers)(obs)
+        mlp = ReluMLP(2 * self.action_size, self.hidden_size, self.hidden_layers, precision=self.precision)
+        outputs = mlp(obs)
         loc, raw_scale = jnp.split(outputs, 2, axis=-1)
         return TanhGaussian(loc, nn.softplus(raw_scale) + MIN_SCALE, self.most)
 
@@ -156,19 +199,19 @@ class Actor(nn.Module):
 
 
 class TwinCritic(nn.Module):
-    """Two independent Q(s, a)."""
+    """Two independent Q(s, a); `norm` and `precision` as in `ReluMLP`."""
 
     hidden_size: int
     hidden_layers: int
     norm: str = "none"
+    precision: str = "default"
 
     @nn.compact
     def __call__(self, obs: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         """obs [..., O], action [..., A] -> Q_1 [...], Q_2 [...]."""
         inputs = jnp.concatenate([obs, action], axis=-1)
-        first = ReluMLP(1, self.hidden_size, self.hidden_layers, self.norm, name="first")(inputs)
-        second = ReluMLP(1, self.hidden_size, self.hidden_layers, self.norm, name="second")(inputs)
-        return first[..., 0], second[..., 0]
+        critic = partial(ReluMLP, 1, self.hidden_size, self.hidden_layers, self.norm, self.precision)
+        return critic(name="first")(inputs)[..., 0], critic(name="second")(inputs)[..., 0]
 
     def values(self, params: Params, obs: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Q_1, Q_2 [...] of these parameters."""

@@ -65,9 +65,10 @@ class Limits(NamedTuple):
 def make_networks(settings: SacSettings, spec: EnvSpec) -> Networks:
     size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
     most = networks.LOG_PROB_BOUND if settings.bound_log_prob else float("inf")
+    precision = settings.network_precision
     return Networks(
-        actor=networks.Actor(spec.action_size, size, layers, most),
-        critic=networks.TwinCritic(size, layers, settings.critic_norm),
+        actor=networks.Actor(spec.action_size, size, layers, most, precision),
+        critic=networks.TwinCritic(size, layers, settings.critic_norm, precision),
     )
 
 
@@ -89,7 +90,7 @@ def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> Agent:
 
 
 def learning_rate(settings: SacSettings, first: jax.Array, env_steps: jax.Array) -> jax.Array:
-    """[] what Adam steps with after `env_steps`: from `first` on a line to the share `policy_learning_rate_decay` of it.
+    """[] what Adam steps with after `env_steps`: on a line from `first` to a share of it, `policy_learning_rate_decay`.
 
     Large steps find a policy, and small ones tell apart actions whose values differ by less than the noise that large
     steps leave in the critics. The line's end is a setting of its own, so that a run can be prolonged.

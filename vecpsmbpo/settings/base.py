@@ -49,6 +49,7 @@ class Settings:
     loggers: tuple[str, ...] = choice("tensorboard", "wandb", "mlflow")
     devices: int = whole(0)
     compile_cache: bool
+    network_precision: str = choice("default", "float32", "bfloat16")
     # real data
     warmup_steps: int = whole(1)
     replay_capacity: int = whole(1)

@@ -1,0 +1,30 @@
+"""What `tools/bench.py pieces` counts, and that an update does not fall into more pieces unnoticed."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from tools import bench
+from vecpsmbpo import config
+
+
+def test_products_are_counted_inside_loops_only():
+    def program(x):
+        def body(carry, _):
+            return jnp.tanh(carry @ x) @ x, None  # two
+
+        return jax.lax.scan(body, x @ x, None, length=3)[0]  # and one before
+
+    text = jax.jit(program).lower(jnp.ones((8, 8))).compile().as_text()
+    assert bench.loop_pieces(text)["products"] == 2
+
+
+@pytest.mark.parametrize(("norm", "fusions"), [("none", 200), ("layer", 310)])
+def test_an_update_is_at_most_45_products(norm, fusions):
+    """By hand, networks being of three products, forwards: an actor, two targets and two critics, 15, and an actor and
+    two critics for the actor's loss, 9. Backwards: two critics to weights and hidden layers, 10, two critics to the
+    actions, 6, and the actor, 5. XLA makes sums of some of those with a single column. Of fusions there may be a tenth
+    more than there were when this was written."""
+    found = bench.pieces_of_update(config.compose(["env=hopper", f"critic_norm={norm}", "updates_per_step=5"]))
+    assert 30 <= found["products"] <= 45
+    assert found["fusions"] <= fusions
