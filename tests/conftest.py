@@ -12,8 +12,9 @@ os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2 --xla_cpu_mu
 import jax
 import pytest
 
-from tests import looks
+from tests import looks, shapes
 
+shapes.check_core()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

@@ -20,7 +20,9 @@ def test_negative_log_likelihood_is_that_of_a_normal_without_its_constant():
     assert value == pytest.approx(np.log(4) / 2 + 9 / 8)
     mean, log_variance, target = np.random.default_rng(0).normal(size=(3, 100))
     expected = -scipy.stats.norm.logpdf(target, mean, np.exp(log_variance / 2)) - np.log(2 * np.pi) / 2
-    np.testing.assert_allclose(dynamics.negative_log_likelihood(mean, log_variance, target), expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        dynamics.negative_log_likelihood(*map(jnp.asarray, (mean, log_variance, target))), expected, rtol=1e-5
+    )
 
 
 def test_log_variance_is_clamped_softly(key):

@@ -35,14 +35,14 @@ def test_normal_against_scipy():
     loc, log_std, action = random.normal(size=(3, 50, 2))
     law = networks.Normal(jnp.asarray(loc), jnp.asarray(log_std))
     theirs = scipy.stats.norm(loc, np.exp(log_std))
-    np.testing.assert_allclose(law.log_prob(action), theirs.logpdf(action).sum(-1), rtol=1e-4)
+    np.testing.assert_allclose(law.log_prob(jnp.asarray(action)), theirs.logpdf(action).sum(-1), rtol=1e-4)
     np.testing.assert_allclose(law.entropy(), theirs.entropy().sum(-1), rtol=1e-4)
 
 
 def test_divergence_of_normals_by_monte_carlo():
     ours = networks.Normal(jnp.array([0.5, -1.0]), jnp.array([0.2, -0.5]))
     other = networks.Normal(jnp.array([0.0, -0.5]), jnp.array([-0.1, 0.3]))
-    samples = np.random.default_rng(0).normal(ours.loc, np.exp(ours.log_std), size=(200_000, 2))
+    samples = jnp.asarray(np.random.default_rng(0).normal(ours.loc, np.exp(ours.log_std), size=(200_000, 2)))
     estimate = np.mean(np.asarray(ours.log_prob(samples)) - np.asarray(other.log_prob(samples)))
     assert float(ours.divergence_to(other)) == pytest.approx(estimate, abs=0.01)
     assert float(ours.divergence_to(ours)) == 0

@@ -4,6 +4,7 @@
     python tools/bench.py pieces      what XLA makes of one SAC update: products, fusions and copies inside the loop
     python tools/bench.py capacity    cost of a step at a large and at a small replay capacity
     python tools/bench.py program     cost of a step of the whole program, against its SAC updates alone
+    python tools/bench.py profile     where the time of an epoch and its evaluation goes (default: the quick start)
     python tools/bench.py envs        steps per second and compile seconds of every task, on each backend and batch size
     python tools/bench.py host        host simulators stepped in a loop, by threads and by processes
 
@@ -25,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vecpsmbpo import config, envs, replay, runtime, sac
+from vecpsmbpo.algorithms.ps_mbpo.algorithm import PsMbpo
 from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.envs import registry, specs
 from vecpsmbpo.schedule import over_seeds
@@ -40,6 +42,7 @@ PAPER = [
     "horizon_last=1",
     "warmup_steps=250",
 ]
+PROFILE_SECONDS = 150  # after which a large program's strides have been timed often enough
 SMALL = ["env=cartpole_swingup", "size=cpu", "warmup_steps=250", "rollout_starts=2500"]
 
 
@@ -200,6 +203,89 @@ def bench_program() -> dict[str, Any]:
     return {"ms_per_step": 1e3 * whole, "ms_of_updates_alone": 1e3 * alone, "ratio": whole / alone}
 
 
+def bench_profile() -> dict[str, Any]:
+    """Strides of the real program are timed one by one: before the warm-up is over they are the world alone, then
+    updates come on top, and at the start of every period a refresh. What cannot be told apart so is timed by itself."""
+    driver = driver_of([] if sys.argv[2:] else ["env=cartpole_swingup", "size=cpu"])
+    settings = driver.settings
+    if settings.model_update_every == settings.stride:
+        sys.exit(f"profile: model_update_every={settings.model_update_every} is one stride; periods need more than one")
+    keys, given = initial_inputs(settings)
+    state = driver.init(keys, given)
+    driver.compile(state)
+    warm, per_epoch = settings.first_learning_step // settings.stride, settings.epoch_steps // settings.stride
+    state = run_strides(driver, state, warm - 4)
+    world, learning, refreshing = [], [], []
+    for _ in range(4):
+        state, seconds = timed_stride(driver, state)
+        world.append(seconds)
+    began = time.perf_counter()
+    for index in range(per_epoch):
+        state, seconds = timed_stride(driver, state)
+        (learning if index % (per_epoch // settings.refreshes_per_epoch) else refreshing).append(seconds)
+        if index and time.perf_counter() - began > PROFILE_SECONDS:
+            break
+    imagining = seconds_per_refresh(driver, state)
+    began = time.perf_counter()
+    driver.evaluate(state, keys, settings.eval_episodes)
+    evaluating = time.perf_counter() - began
+    lanes = len(settings.lanes)
+    stepping = lanes * settings.epoch_steps / mjx_steps(settings.env, lanes)["steps_per_s"]
+    acting = per_epoch * np.median(world)
+    updating = per_epoch * (np.median(learning) - np.median(world))
+    refresh = settings.refreshes_per_epoch * (np.mean(refreshing) - np.median(learning))
+    imagining *= settings.refreshes_per_epoch
+    seconds_of = {
+        "updating": updating,
+        "fitting": refresh - imagining,
+        "imagining": imagining,
+        "stepping": stepping,
+        "acting_and_observing": acting - stepping,
+        "evaluating": evaluating,
+    }
+    whole = sum(seconds_of.values())
+    return {
+        "task": settings.env,
+        "members": settings.n_members,
+        "width": settings.policy_hidden_size,
+        "from_step": settings.first_learning_step,
+        "seconds_of_an_epoch": whole,
+        **{name: seconds / whole for name, seconds in seconds_of.items()},
+    }
+
+
+def run_strides(driver: ScanDriver, state: TrainState, strides: int) -> TrainState:
+    """An epoch at a time, which is what the program has room to report."""
+    most = driver.settings.epoch_steps // driver.settings.stride
+    while strides > 0:
+        state, _ = driver.run(state, min(strides, most))
+        strides -= most
+    return state
+
+
+def timed_stride(driver: ScanDriver, state: TrainState) -> tuple[TrainState, float]:
+    began = time.perf_counter()
+    state, _ = driver.run(state, 1)
+    jax.block_until_ready(state)
+    return state, time.perf_counter() - began
+
+
+def seconds_per_refresh(driver: ScanDriver, state: TrainState) -> float:
+    """Of imagining alone, for every member; 0 where the algorithm does not."""
+    algorithm = driver.algorithm
+    if not isinstance(algorithm, PsMbpo):
+        return 0.0
+    specs = driver.layout.specs()
+
+    def body(state: TrainState) -> Any:
+        imagine = lambda counters, seed, key: algorithm.imagine(counters, seed, jnp.bool_(True), key)[1]  # noqa: E731
+        return over_seeds(imagine)(state.counters, state.seeds, state.seeds.key).imagined
+
+    run = driver.layout.spread(body, (specs,), specs.seeds.imagined)
+    jax.block_until_ready(run(state))
+    return best_seconds(lambda: run(state), 2)
+
+
 def bench_envs() -> list[dict[str, Any]]:
     """Every task (or those named) on every backend that it has; actions are uniform."""
     found = []
@@ -285,6 +371,7 @@ BENCHES = {
     "pieces": bench_pieces,
     "capacity": bench_capacity,
     "program": bench_program,
+    "profile": bench_profile,
 }
 
 if __name__ == "__main__":

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from vecpsmbpo import networks, optim, replay
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import EnvSpec, Hyper, Model, Moments, Params, Prior, Scaling, Transition
+from vecpsmbpo.types import Count, EnvSpec, Hyper, Model, Moments, Params, Prior, Scaling, Transition
 
 VALIDATION_BATCH = 512
 
@@ -31,19 +32,21 @@ class Split(NamedTuple):
     blocks: jax.Array
 
     @classmethod
-    def draw(cls, key: jax.Array, rows: jax.Array, capacity: int, block: int) -> "Split":
+    def draw(cls, key: PRNGKeyArray, rows: Count, capacity: int, block: int) -> "Split":
         offset = jax.random.randint(key, (-(-capacity // block),), 0, block)
         return cls(offset, jnp.minimum(rows, capacity) // block)
 
-    def train_rows(self, key: jax.Array, batch: int, block: int) -> jax.Array:
-        """[batch] indices of training rows, uniform with replacement."""
+    def train_rows(self, key: PRNGKeyArray, batch: int, block: int) -> Int[Array, " {batch}"]:
+        """Indices of training rows, uniform with replacement."""
         which, member = jax.random.split(key)
         chosen = jax.random.randint(which, (batch,), 0, jnp.maximum(self.blocks, 1))
         shift = jax.random.randint(member, (batch,), 1, block)  # anything but the validating row
         return chosen * block + (self.offset[chosen] + shift) % block
 
-    def validation_rows(self, start: jax.Array, batch: int, block: int) -> tuple[jax.Array, jax.Array]:
-        """Validation rows `start` to `start + batch`: their indices, and which of them exist, [batch] each."""
+    def validation_rows(
+        self, start: Count, batch: int, block: int
+    ) -> tuple[Int[Array, " {batch}"], Bool[Array, " {batch}"]]:
+        """Validation rows `start` to `start + batch`: their indices, and which of them exist."""
         chosen = start + jnp.arange(batch)
         exists = chosen < self.blocks
         chosen = jnp.where(exists, chosen, 0)
@@ -60,7 +63,7 @@ def network(settings: Settings, spec: EnvSpec) -> networks.GaussianMLP:
     )
 
 
-def init(key: jax.Array, hyper: Hyper, settings: Settings, spec: EnvSpec) -> Model:
+def init(key: PRNGKeyArray, hyper: Hyper, settings: Settings, spec: EnvSpec) -> Model:
     size = spec.obs_size + spec.action_size
     net, zero = network(settings, spec), jnp.zeros(())
     params = net.init(key, jnp.zeros(size))
@@ -71,7 +74,7 @@ def init(key: jax.Array, hyper: Hyper, settings: Settings, spec: EnvSpec) -> Mod
     return Model(params, optim.init(params), plain, loss=zero, val_mse=zero, prior=prior)
 
 
-def scaling(moments: Moments, rows: jax.Array, settings: Settings) -> Scaling:
+def scaling(moments: Moments, rows: Count, settings: Settings) -> Scaling:
     """What whitens the inputs (equation 20) and, with `whiten_targets`, the outputs: changes Δs and rewards.
 
     What has never varied is left unscaled: there is nothing to learn of it yet, and dividing by a vanishing deviation
@@ -84,8 +87,10 @@ def scaling(moments: Moments, rows: jax.Array, settings: Settings) -> Scaling:
     return Scaling(moments.mean[:size], std[:size], outputs)
 
 
-def forward(model: Model, obs: jax.Array, action: jax.Array, *, net: networks.GaussianMLP) -> networks.Prediction:
-    """What the model says of (Δs, r) (equations 20 and 34). Shapes: obs [..., O], action [..., A]."""
+def forward(
+    model: Model, obs: Float[Array, "*batch O"], action: Float[Array, "*batch A"], *, net: networks.GaussianMLP
+) -> networks.Prediction:
+    """What the model says of (Δs, r) (equations 20 and 34)."""
     scaling = model.scaling
     inputs = (jnp.concatenate([obs, action], axis=-1) - scaling.input_mean) / scaling.input_std
     prior: Any = 0.0
@@ -104,12 +109,16 @@ class Successor(NamedTuple):
 
 
 def predict(
-    model: Model, obs: jax.Array, action: jax.Array, key: jax.Array, *, net: networks.GaussianMLP, spec: EnvSpec
+    model: Model,
+    obs: Float[Array, "*batch O"],
+    action: Float[Array, "*batch A"],
+    key: PRNGKeyArray,
+    *,
+    net: networks.GaussianMLP,
+    spec: EnvSpec,
 ) -> Successor:
     """A draw of (s', r) ~ N((s + Δs, r), σ²) (equation 21), and whether it ends the episode: by the task's own rule,
     or drawn with the learned probability where that is not known.
-
-    Shapes: obs [..., O], action [..., A].
     """
     prediction = forward(model, obs, action, net=net)
     noise = jax.random.normal(key, prediction.mean.shape)
@@ -118,7 +127,13 @@ def predict(
 
 
 def predict_mean(
-    model: Model, obs: jax.Array, action: jax.Array, key: jax.Array, *, net: networks.GaussianMLP, spec: EnvSpec
+    model: Model,
+    obs: Float[Array, "*batch O"],
+    action: Float[Array, "*batch A"],
+    key: PRNGKeyArray,
+    *,
+    net: networks.GaussianMLP,
+    spec: EnvSpec,
 ) -> Successor:
     """As `predict`, with the mean of (s', r); a learned end of the episode is drawn all the same."""
     prediction = forward(model, obs, action, net=net)
@@ -136,8 +151,10 @@ def _successor(
     return Successor(next_obs, reward, spec.terminated(obs, action, next_obs))
 
 
-def negative_log_likelihood(mean: jax.Array, log_variance: jax.Array, target: jax.Array) -> jax.Array:
-    """Equation 17 without its constant, elementwise: log σ² / 2 + (y - μ)² / (2 σ²)."""
+def negative_log_likelihood(
+    mean: Float[Array, "*batch"], log_variance: Float[Array, "*batch"], target: Float[Array, "*batch"]
+) -> Float[Array, "*batch"]:
+    """Equation 17 without its constant: log σ² / 2 + (y - μ)² / (2 σ²)."""
     return 0.5 * log_variance + 0.5 * (target - mean) ** 2 * jnp.exp(-log_variance)
 
 
@@ -146,7 +163,7 @@ def _targets(batch: Transition) -> jax.Array:
     return jnp.concatenate([batch.next_obs - batch.obs, batch.reward[:, None]], axis=-1)
 
 
-def loss(model: Model, batch: Transition, *, net: networks.GaussianMLP) -> jax.Array:
+def loss(model: Model, batch: Transition, *, net: networks.GaussianMLP) -> Float[Array, ""]:
     """Equation 17, averaged over rows and outputs; where termination is learned, plus its cross-entropy.
 
     Args:
@@ -160,9 +177,14 @@ def loss(model: Model, batch: Transition, *, net: networks.GaussianMLP) -> jax.A
 
 
 def validation_error(
-    model: Model, rows_of: Callable[[jax.Array], Transition], split: Split, block: int, *, net: networks.GaussianMLP
-) -> jax.Array:
-    """Mean squared error over the validation rows, [], in units of the model's outputs, in batches of a fixed size;
+    model: Model,
+    rows_of: Callable[[Int[Array, " B"]], Transition],
+    split: Split,
+    block: int,
+    *,
+    net: networks.GaussianMLP,
+) -> Float[Array, ""]:
+    """Mean squared error over the validation rows, in units of the model's outputs, in batches of a fixed size;
     where termination is learned, plus its cross-entropy.
 
     Args:
@@ -184,11 +206,11 @@ def validation_error(
 
 def fit(
     model: Model,
-    real: jax.Array,
+    real: Float[Array, "C F"],
     split: Split,
     whitening: Scaling,
     hyper: Hyper,
-    key: jax.Array,
+    key: PRNGKeyArray,
     *,
     settings: Settings,
     spec: EnvSpec,
@@ -202,7 +224,7 @@ def fit(
     Every trip count is traced: one compiled program serves a data set of any size.
 
     Args:
-        real: D_E, [C, F].
+        real: D_E.
         split: which of its rows train and which validate.
         whitening: of its rows.
     """

@@ -5,10 +5,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from vecpsmbpo import dynamics, replay, sac
 from vecpsmbpo.settings.parts import ImaginationSettings
-from vecpsmbpo.types import EnvSpec, Model, Params, Transition
+from vecpsmbpo.types import Count, EnvSpec, Model, Params, Transition
 
 LARGEST_CHUNK = 4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
 
@@ -39,7 +40,7 @@ def ring_capacity(settings: ImaginationSettings) -> int:
     return max(min(wanted, settings.imagined_capacity) // chunk, 1) * chunk
 
 
-def horizon(settings: ImaginationSettings, env_steps: jax.Array) -> jax.Array:
+def horizon(settings: ImaginationSettings, env_steps: Int[Array, "*steps"] | int) -> Int[Array, "*steps"]:
     """Table 1's schedule x → y over epochs a → b: ⌊clip(x + (k - a) / (b - a) · (y - x))⌋.
 
     k counts whole epochs of 1000 environment steps, whatever `epoch_steps` is.
@@ -51,7 +52,7 @@ def horizon(settings: ImaginationSettings, env_steps: jax.Array) -> jax.Array:
     return jnp.floor(jnp.clip(value, min(first, last), max(first, last))).astype(jnp.int32)
 
 
-def chunks_per_refresh(settings: ImaginationSettings, horizon: jax.Array) -> jax.Array:
+def chunks_per_refresh(settings: ImaginationSettings, horizon: Int[Array, "*steps"] | int) -> Int[Array, "*steps"]:
     """How many chunks of start states one refresh rolls out.
 
     When starts × horizon would exceed the ring, there are fewer starts; a rollout is never cut short.
@@ -60,13 +61,13 @@ def chunks_per_refresh(settings: ImaginationSettings, horizon: jax.Array) -> jax
     return jnp.clip(ring_capacity(settings) // (horizon * chunk), 1, settings.rollout_starts // chunk)
 
 
-def rows_per_refresh(settings: ImaginationSettings, env_steps: jax.Array) -> jax.Array:
+def rows_per_refresh(settings: ImaginationSettings, env_steps: Int[Array, "*steps"] | int) -> Int[Array, "*steps"]:
     """How many transitions one refresh imagines for each member."""
     now = horizon(settings, env_steps)
     return chunks_per_refresh(settings, now) * now * chunk_size(settings)
 
 
-def retained_rows(settings: ImaginationSettings, env_steps: jax.Array) -> jax.Array:
+def retained_rows(settings: ImaginationSettings, env_steps: Count) -> Int[Array, ""]:
     """How many of the newest rows policies learn from after `env_steps` steps: those of one epoch of refreshes.
 
     As both MBPO codebases have it: older rows come from models fitted on less data and from policies of long ago. Each
@@ -81,13 +82,18 @@ def retained_rows(settings: ImaginationSettings, env_steps: jax.Array) -> jax.Ar
 
 
 def step(
-    model: Model, actor: Params, obs: jax.Array, key: jax.Array, *, settings: ImaginationSettings, spec: EnvSpec
+    model: Model,
+    actor: Params,
+    obs: Float[Array, "B O"],
+    key: PRNGKeyArray,
+    *,
+    settings: ImaginationSettings,
+    spec: EnvSpec,
 ) -> Transition:
     """One imagined step of one member for a batch of states.
 
     Args:
         model: the member's own, or with `rollout_models=any` all of them, [N, ...].
-        obs: [B, O].
 
     Returns:
         Transition with leaves [B, ...]; the policy's sampled action, the model's sampled successor, reward and end.
@@ -103,7 +109,11 @@ def step(
 
 
 def predict_with_any(
-    predict: Callable[..., dynamics.Successor], models: Model, obs: jax.Array, action: jax.Array, key: jax.Array
+    predict: Callable[..., dynamics.Successor],
+    models: Model,
+    obs: Float[Array, "B O"],
+    action: Float[Array, "B A"],
+    key: PRNGKeyArray,
 ) -> dynamics.Successor:
     """For every row a model drawn anew, as in MBPO and in TS1 of PETS.
 
@@ -113,7 +123,6 @@ def predict_with_any(
     Args:
         predict: of one model.
         models: leaves [N, ...].
-        obs, action: [B, O], [B, A].
     """
     key, shuffle_key = jax.random.split(key)
     count, rows = models.loss.shape[0], obs.shape[0]
@@ -125,6 +134,8 @@ def predict_with_any(
     return jax.tree.map(lambda x: x.reshape(count * part, *x.shape[2:])[place], answers)
 
 
-def start_states(real: jax.Array, rows: jax.Array, key: jax.Array, count: int, spec: EnvSpec) -> jax.Array:
-    """[count, O] observations drawn uniformly from D_E, [C, F]."""
+def start_states(
+    real: Float[Array, "C F"], rows: Count, key: PRNGKeyArray, count: int, spec: EnvSpec
+) -> Float[Array, "{count} O"]:
+    """Observations drawn uniformly from D_E."""
     return real[replay.sample_indices(key, (count,), rows, real.shape[0]), : spec.obs_size]

@@ -2,13 +2,16 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from vecpsmbpo.settings.parts import PosteriorSettings
-from vecpsmbpo.types import Bandit, Hyper
+from vecpsmbpo.types import Bandit, Count, Hyper, Number
 
 
-def real_ratios(settings: PosteriorSettings, hyper: Hyper, bandit: Bandit | None, env_steps: jax.Array) -> jax.Array:
-    """[N·M] the λ with which each member learns now."""
+def real_ratios(
+    settings: PosteriorSettings, hyper: Hyper, bandit: Bandit | None, env_steps: Count
+) -> Float[Array, " members"]:
+    """The λ with which each member learns now."""
     if bandit is not None:
         return jnp.asarray(settings.real_ratio_arms)[arms_of_members(settings, bandit)]
     ratio = hyper.real_ratio
@@ -19,7 +22,7 @@ def real_ratios(settings: PosteriorSettings, hyper: Hyper, bandit: Bandit | None
     return jnp.broadcast_to(ratio, (settings.n_members,))
 
 
-def linear(mean: jax.Array, progress: jax.Array) -> jax.Array:
+def linear(mean: Number, progress: Number) -> Float[Array, ""]:
     """λ after a share `progress` of the learning, on a line from 1 to 0 under which lies the same area as under the
     constant `mean` (figure 13).
 
@@ -54,8 +57,8 @@ def linear(mean: jax.Array, progress: jax.Array) -> jax.Array:
 GRID = 512
 
 
-def arms_of_members(settings: PosteriorSettings, bandit: Bandit) -> jax.Array:
-    """[N·M] the arm of each member: the arms' probabilities cut into N·M equal pieces, in the order of λ.
+def arms_of_members(settings: PosteriorSettings, bandit: Bandit) -> Int[Array, " members"]:
+    """The arm of each member: the arms' probabilities cut into N·M equal pieces, in the order of λ.
 
     So a member's λ moves from one arm to the next or stays; m decides before n, so that every model has members of high
     and of low λ. An arm less likely than half a piece rests until forgetting makes it likelier again.
@@ -73,7 +76,7 @@ def init(settings: PosteriorSettings) -> Bandit:
     return Bandit(excess=nothing, counts=nothing, rounds=jnp.int32(0), lowest=most, highest=-most)
 
 
-def discount(rounds: jax.Array) -> jax.Array:
+def discount(rounds: Count) -> Float[Array, ""]:
     """What of earlier rounds is left after one more: 1 - 1 / (8 √rounds).
 
     The order is that of the optimum for few changes (Garivier and Moulines, 2011, who take 1 / 4); rounds so far stand
@@ -83,7 +86,7 @@ def discount(rounds: jax.Array) -> jax.Array:
     return 1 - 1 / (8 * jnp.sqrt(rounds))
 
 
-def credit(bandit: Bandit, arm: jax.Array, episode_return: jax.Array) -> Bandit:
+def credit(bandit: Bandit, arm: Count, episode_return: Number) -> Bandit:
     """Adds an episode's return to its arm.
 
     The range shrinks around its middle as old rounds are forgotten, and always holds the newest return: an outlier or
@@ -105,8 +108,8 @@ def credit(bandit: Bandit, arm: jax.Array, episode_return: jax.Array) -> Bandit:
     )
 
 
-def beliefs(bandit: Bandit) -> tuple[jax.Array, jax.Array]:
-    """[K] each: the parameters of the Beta distribution of what each arm gains, uniform at first.
+def beliefs(bandit: Bandit) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
+    """The parameters of the Beta distribution of what each arm gains, uniform at first.
 
     A gain is where the return lies in the range of returns, from 0 to 1; a gain of 0.3 is 0.3 successes and 0.7
     failures. While all returns are equal, as before the first success of a sparse task, all gains are 0: arms that were
@@ -116,8 +119,8 @@ def beliefs(bandit: Bandit) -> tuple[jax.Array, jax.Array]:
     return 1 + gains, 1 + bandit.counts - gains
 
 
-def probabilities(bandit: Bandit) -> jax.Array:
-    """[K] how likely each arm is the best, ∫ p_i(x) Π_{j ≠ i} P(x_j < x) dx: the distribution that Thompson sampling
+def probabilities(bandit: Bandit) -> Float[Array, " K"]:
+    """How likely each arm is the best, ∫ p_i(x) Π_{j ≠ i} P(x_j < x) dx: the distribution that Thompson sampling
     draws from. By the midpoint rule over θ, x = sin² θ, where Beta distributions are about as wide everywhere."""
     wins, losses = beliefs(bandit)
     angle = jnp.pi / 2 * (jnp.arange(GRID) + 0.5) / GRID

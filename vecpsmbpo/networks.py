@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from vecpsmbpo.types import Params
 
@@ -78,17 +79,22 @@ class GaussianMLP(nn.Module):
     precision: str = "default"
 
     @nn.compact
-    def outputs(self, inputs: jax.Array) -> jax.Array:
-        """f_θ: inputs [..., O + A], whitened, to what the prediction is made of."""
+    def outputs(self, inputs: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
+        """f_θ: inputs (s, a), whitened, to what the prediction is made of."""
         hidden = inputs
         for _ in range(self.hidden_layers):
             hidden = nn.swish(hidden_layer(self.hidden_size, model_init, self.precision)(hidden))
         return last_layer(2 * self.output_size + self.predicts_termination, model_init, self.precision)(hidden)
 
-    def __call__(self, inputs: jax.Array, scale: Any = 1.0, prior: Any = 0.0) -> Prediction:
-        """The prediction of f_θ + prior, whose outputs are in units of `scale` [O + 1].
+    def __call__(
+        self,
+        inputs: Float[Array, "*batch inputs"],
+        scale: Float[Array, " predicted"] | float = 1.0,
+        prior: Any = 0.0,
+    ) -> Prediction:
+        """The prediction of f_θ + prior, whose outputs are in units of `scale`.
 
-        inputs [..., O + A], whitened. In small units the variance may rise as far as in the plain ones.
+        Inputs (s, a) are whitened. In small units the variance may rise as far as in the plain ones.
         """
         outputs = self.outputs(inputs) + prior
         mean, log_variance, rest = jnp.split(outputs, [self.output_size, 2 * self.output_size], axis=-1)
@@ -99,8 +105,8 @@ class GaussianMLP(nn.Module):
         return Prediction(mean * scale, log_variance + unit, rest[..., 0] if self.predicts_termination else None)
 
 
-def layer_norm(x: jax.Array) -> jax.Array:
-    """Each row of x [..., H] at mean 0 and variance 1 (Ba et al., 2016).
+def layer_norm(x: Float[Array, "*batch H"]) -> Float[Array, "*batch H"]:
+    """Each row at mean 0 and variance 1 (Ba et al., 2016).
 
     Without gain and offset, which the dense layers around it have, and written out: XLA's code for a CPU then costs a
     third of flax's `LayerNorm` beside products of 64 columns (docs/lab_notes.md).
@@ -109,8 +115,8 @@ def layer_norm(x: jax.Array) -> jax.Array:
     return rms_norm(exact - jnp.mean(exact, axis=-1, keepdims=True)).astype(x.dtype)
 
 
-def rms_norm(x: jax.Array) -> jax.Array:
-    """Each row of x [..., H] at mean square 1 (Zhang and Sennrich, 2019)."""
+def rms_norm(x: Float[Array, "*batch H"]) -> Float[Array, "*batch H"]:
+    """Each row at mean square 1 (Zhang and Sennrich, 2019)."""
     squares = jnp.square(x.astype(jnp.float32))
     return x * jax.lax.rsqrt(jnp.mean(squares, axis=-1, keepdims=True) + 1e-6).astype(x.dtype)
 
@@ -133,7 +139,7 @@ class ReluMLP(nn.Module):
     precision: str = "default"
 
     @nn.compact
-    def __call__(self, hidden: jax.Array) -> jax.Array:
+    def __call__(self, hidden: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         for _ in range(self.hidden_layers):
             layer = hidden_layer(self.hidden_size, policy_init, self.precision)
             hidden = nn.relu(NORMS[self.norm](layer(hidden)))
@@ -152,12 +158,14 @@ class TanhGaussian(NamedTuple):
     scale: jax.Array
     most: float = float("inf")
 
-    def sample(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """An action [..., A] and its log-density [...]."""
+    def sample(self, key: PRNGKeyArray) -> tuple[Float[Array, "*batch A"], Float[Array, "*batch"]]:
+        """An action and its log-density."""
         return self.reparameterized(jax.random.normal(key, self.loc.shape))
 
-    def reparameterized(self, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The action [..., A] that standard normal noise [..., A] becomes, and its log-density [...]."""
+    def reparameterized(
+        self, noise: Float[Array, "*batch A"]
+    ) -> tuple[Float[Array, "*batch A"], Float[Array, "*batch"]]:
+        """The action that standard normal noise becomes, and its log-density."""
         pre_tanh = self.loc + self.scale * noise
         log_normal = -0.5 * noise**2 - jnp.log(self.scale) - 0.5 * jnp.log(2 * jnp.pi)
         # log(1 - tanh²u) = 2 (log 2 - u - softplus(-2u)): no cancellation where tanh saturates.
@@ -165,8 +173,8 @@ class TanhGaussian(NamedTuple):
         log_slope = 2 * (jnp.log(2.0) - bounded - jax.nn.softplus(-2 * bounded))
         return jnp.tanh(pre_tanh), jnp.sum(log_normal - log_slope, axis=-1)
 
-    def mode(self) -> jax.Array:
-        """tanh(loc) [..., A]: the action taken in evaluation."""
+    def mode(self) -> Float[Array, "*batch A"]:
+        """tanh(loc): the action taken in evaluation."""
         return jnp.tanh(self.loc)
 
 
@@ -185,14 +193,14 @@ class Actor(nn.Module):
     precision: str = "default"
 
     @nn.compact
-    def __call__(self, obs: jax.Array) -> TanhGaussian:
-        """obs [..., O] -> law of actions [..., A]."""
+    def __call__(self, obs: Float[Array, "*batch O"]) -> TanhGaussian:
+        """The law of actions."""
         mlp = ReluMLP(2 * self.action_size, self.hidden_size, self.hidden_layers, precision=self.precision)
         outputs = mlp(obs)
         loc, raw_scale = jnp.split(outputs, 2, axis=-1)
         return TanhGaussian(loc, nn.softplus(raw_scale) + MIN_SCALE, self.most)
 
-    def law(self, params: Params, obs: jax.Array) -> TanhGaussian:
+    def law(self, params: Params, obs: Float[Array, "*batch O"]) -> TanhGaussian:
         """π(· | obs) of these parameters."""
         law: Any = self.apply(params, obs)
         return law
@@ -207,13 +215,17 @@ class TwinCritic(nn.Module):
     precision: str = "default"
 
     @nn.compact
-    def __call__(self, obs: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """obs [..., O], action [..., A] -> Q_1 [...], Q_2 [...]."""
+    def __call__(
+        self, obs: Float[Array, "*batch O"], action: Float[Array, "*batch A"]
+    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        """Q_1 and Q_2."""
         inputs = jnp.concatenate([obs, action], axis=-1)
         critic = partial(ReluMLP, 1, self.hidden_size, self.hidden_layers, self.norm, self.precision)
         return critic(name="first")(inputs)[..., 0], critic(name="second")(inputs)[..., 0]
 
-    def values(self, params: Params, obs: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Q_1, Q_2 [...] of these parameters."""
+    def values(
+        self, params: Params, obs: Float[Array, "*batch O"], action: Float[Array, "*batch A"]
+    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        """Q_1 and Q_2 of these parameters."""
         values: Any = self.apply(params, obs, action)
         return values

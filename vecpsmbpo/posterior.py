@@ -2,8 +2,9 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from vecpsmbpo.types import Episode, Posterior
+from vecpsmbpo.types import Count, Episode, Flag, Number, Posterior
 
 STARTS = 32  # K, episodes whose first observations members are asked about
 
@@ -12,7 +13,7 @@ def init(members: int) -> Posterior:
     return Posterior(jnp.zeros(members), jnp.zeros(members), jnp.zeros(members, jnp.int32))
 
 
-def credit(posterior: Posterior, member: jax.Array, episode_return: jax.Array, counts: jax.Array) -> Posterior:
+def credit(posterior: Posterior, member: Count, episode_return: Number, counts: Flag) -> Posterior:
     """Adds an episode's return to its member where `counts` (equation 19 sums over all past episodes).
 
     Compensated (Kahan) addition: after hundreds of episodes of thousands, plain float32 sums would be off by more
@@ -25,16 +26,20 @@ def credit(posterior: Posterior, member: jax.Array, episode_return: jax.Array, c
     return Posterior(total, compensation, posterior.episodes + credited)
 
 
-def add_start(starts: jax.Array | None, episode: Episode, obs: jax.Array) -> jax.Array | None:
-    """The ring [K, O] with the first observation [O] of this episode; unchanged at its later steps."""
+def add_start(
+    starts: Float[Array, "K O"] | None, episode: Episode, obs: Float[Array, " O"]
+) -> Float[Array, "K O"] | None:
+    """The ring with the first observation of this episode; unchanged at its later steps."""
     if starts is None:
         return None
     place = (episode.index - 1) % STARTS
     return starts.at[place].set(jnp.where(episode.length == 0, obs, starts[place]))
 
 
-def logits(posterior: Posterior, values: jax.Array | None, temperature: jax.Array) -> jax.Array:
-    """[N·M] accumulated return / τ (equation 19), or value / τ where there are `values` [N·M].
+def logits(
+    posterior: Posterior, values: Float[Array, " members"] | None, temperature: Number
+) -> Float[Array, " members"]:
+    """Accumulated return / τ (equation 19), or value / τ where there are `values`.
 
     τ = ∞ gives the uniform distribution of equation 18.
     """
@@ -44,8 +49,8 @@ def logits(posterior: Posterior, values: jax.Array | None, temperature: jax.Arra
     return (centred - posterior.compensation) / temperature
 
 
-def best(posterior: Posterior) -> jax.Array:
-    """The member of highest mean return, [] int, of those that acted in enough episodes to tell.
+def best(posterior: Posterior) -> Int[Array, ""]:
+    """The member of highest mean return, of those that acted in enough episodes to tell.
 
     Enough are half as many as there would be had all members acted equally often, and at least one: the mean of the
     fewest is then at most √2 times as uncertain as that of an average member, and some member always has them. (The sum
@@ -58,11 +63,11 @@ def best(posterior: Posterior) -> jax.Array:
     return jnp.argmax(jnp.where(enough, mean, -jnp.inf))
 
 
-def draw(logits: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A member, [] int, and the distribution [N·M] that it was drawn from."""
+def draw(logits: Float[Array, " members"], key: PRNGKeyArray) -> tuple[Int[Array, ""], Float[Array, " members"]]:
+    """A member, and the distribution that it was drawn from."""
     return jax.random.categorical(key, logits), jax.nn.softmax(logits)
 
 
-def exploration_probability(forced_exploration: jax.Array, episode: jax.Array) -> jax.Array:
+def exploration_probability(forced_exploration: Number, episode: Count) -> Float[Array, ""]:
     """min(1, τ / k): with it the k-th episode after the warm-up, from 1, takes random actions (equation 33)."""
     return jnp.minimum(1.0, forced_exploration / episode)

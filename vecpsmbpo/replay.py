@@ -6,8 +6,9 @@ ever added is kept by the caller (see `types.Counters`).
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from vecpsmbpo.types import Transition
+from vecpsmbpo.types import Count, Transition
 
 
 def row_size(obs_size: int, action_size: int) -> int:
@@ -15,19 +16,19 @@ def row_size(obs_size: int, action_size: int) -> int:
     return 2 * obs_size + action_size + 2
 
 
-def init(capacity: int, obs_size: int, action_size: int) -> jax.Array:
-    """An empty ring [C, F]."""
+def init(capacity: int, obs_size: int, action_size: int) -> Float[Array, "C F"]:
+    """An empty ring."""
     return jnp.zeros((capacity, row_size(obs_size, action_size)), jnp.float32)
 
 
-def pack(transition: Transition) -> jax.Array:
-    """Transition with leaves [..., O], [..., A], [...] -> rows [..., F]."""
+def pack(transition: Transition) -> Float[Array, "*batch F"]:
+    """Transition with leaves [..., O], [..., A], [...] -> rows."""
     obs, action, reward, next_obs, terminated = transition
     scalars = jnp.stack([reward, terminated.astype(jnp.float32)], axis=-1)
     return jnp.concatenate([obs, action, next_obs, scalars], axis=-1).astype(jnp.float32)
 
 
-def unpack(rows: jax.Array, obs_size: int, action_size: int) -> Transition:
+def unpack(rows: Float[Array, "*batch F"], obs_size: int, action_size: int) -> Transition:
     """The inverse of `pack`."""
     obs, action, next_obs, scalars = jnp.split(
         rows, [obs_size, obs_size + action_size, 2 * obs_size + action_size], axis=-1
@@ -35,8 +36,8 @@ def unpack(rows: jax.Array, obs_size: int, action_size: int) -> Transition:
     return Transition(obs, action, scalars[..., 0], next_obs, scalars[..., 1])
 
 
-def add(ring: jax.Array, rows: jax.Array, added: jax.Array) -> jax.Array:
-    """Writes rows [..., B, F] into ring [..., C, F] after the `added` rows that it has received so far.
+def add(ring: Float[Array, "*rings C F"], rows: Float[Array, "*rings B F"], added: Count) -> Float[Array, "*rings C F"]:
+    """Writes rows into every ring after the `added` rows that it has received so far.
 
     B must divide C, and every earlier block must have been of B rows too: a block never wraps.
     """
@@ -45,19 +46,19 @@ def add(ring: jax.Array, rows: jax.Array, added: jax.Array) -> jax.Array:
     return jax.lax.dynamic_update_slice(ring, rows, start)
 
 
-def sample_indices(key: jax.Array, shape: tuple[int, ...], added: jax.Array, capacity: int) -> jax.Array:
+def sample_indices(key: PRNGKeyArray, shape: tuple[int, ...], added: Count, capacity: int) -> Int[Array, "..."]:
     """Uniform indices of stored rows, with replacement. An empty ring gives zeros."""
     return jax.random.randint(key, shape, 0, jnp.clip(added, 1, capacity))
 
 
 def sample_newest_indices(
-    key: jax.Array, shape: tuple[int, ...], added: jax.Array, capacity: int, newest: jax.Array
-) -> jax.Array:
+    key: PRNGKeyArray, shape: tuple[int, ...], added: Count, capacity: int, newest: Count
+) -> Int[Array, "..."]:
     """As `sample_indices`, of the `newest` rows only."""
     age = jax.random.randint(key, shape, 0, jnp.clip(jnp.minimum(added, newest), 1, capacity))
     return (added - 1 - age) % capacity
 
 
-def count(added: jax.Array, capacity: int) -> jax.Array:
+def count(added: Count, capacity: int) -> Int[Array, ""]:
     """The `added` rows, less whole turns of a full ring: position and fullness stay, and int32 never overflows."""
     return jnp.where(added < capacity, added, capacity + added % capacity)

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from vecpsmbpo import networks, optim
 from vecpsmbpo.settings.parts import SacSettings
-from vecpsmbpo.types import EnvSpec, Hyper, Params, Stats, Transition
+from vecpsmbpo.types import Count, EnvSpec, Hyper, Number, Params, Stats, Transition
 
 
 class SacStats(Stats):
@@ -51,7 +52,7 @@ class Noise(NamedTuple):
     action: jax.Array
 
     @classmethod
-    def draw(cls, key: jax.Array, shape: tuple[int, ...]) -> "Noise":
+    def draw(cls, key: PRNGKeyArray, shape: tuple[int, ...]) -> "Noise":
         return cls(*jax.random.normal(key, (2, *shape)))
 
 
@@ -72,7 +73,7 @@ def make_networks(settings: SacSettings, spec: EnvSpec) -> Networks:
     )
 
 
-def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> Agent:
+def init(key: PRNGKeyArray, nets: Networks, spec: EnvSpec) -> Agent:
     actor_key, critic_key = jax.random.split(key)
     obs, action = jnp.zeros(spec.obs_size), jnp.zeros(spec.action_size)
     actor, critic = nets.actor.init(actor_key, obs), nets.critic.init(critic_key, obs, action)
@@ -89,8 +90,8 @@ def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> Agent:
     )
 
 
-def learning_rate(settings: SacSettings, first: jax.Array, env_steps: jax.Array) -> jax.Array:
-    """[] what Adam steps with after `env_steps`: on a line from `first` to a share of it, `policy_learning_rate_decay`.
+def learning_rate(settings: SacSettings, first: Number, env_steps: Count) -> Number:
+    """What Adam steps with after `env_steps`: on a line from `first` to a share of it, `policy_learning_rate_decay`.
 
     Large steps find a policy, and small ones tell apart actions whose values differ by less than the noise that large
     steps leave in the critics. The line's end is a setting of its own, so that a run can be prolonged.
@@ -102,17 +103,24 @@ def learning_rate(settings: SacSettings, first: jax.Array, env_steps: jax.Array)
 
 
 def target_value(
-    reward: jax.Array, terminated: jax.Array, next_q: jax.Array, next_log_prob: jax.Array, alpha, discount
-) -> jax.Array:
-    """r + γ (1 - terminated) (Q̄(s', a') - α log π(a' | s')) (equations 23, 24 and 29), elementwise.
+    reward: Float[Array, "*batch"],
+    terminated: Float[Array, "*batch"],
+    next_q: Float[Array, "*batch"],
+    next_log_prob: Float[Array, "*batch"],
+    alpha: Number,
+    discount: Number,
+) -> Float[Array, "*batch"]:
+    """r + γ (1 - terminated) (Q̄(s', a') - α log π(a' | s')) (equations 23, 24 and 29).
 
     A truncated transition has terminated = 0 and bootstraps.
     """
     return reward + discount * (1 - terminated) * (next_q - alpha * next_log_prob)
 
 
-def target_range(limits: Limits, alpha: jax.Array, hyper: Hyper, action_size: int) -> tuple[jax.Array, jax.Array]:
-    """The least and the most that Q can be, [] each, if rewards stay within `limits`.
+def target_range(
+    limits: Limits, alpha: Number, hyper: Hyper, action_size: int
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The least and the most that Q can be, if rewards stay within `limits`.
 
     At every step the entropy bonus of equations 24 and 29 is at most that of uniform actions, α A log 2, and about that
     of the target entropy where that is negative. No reward at all, as after a termination, is always possible.
@@ -127,13 +135,13 @@ def critic_loss(
     critic: Params,
     agent: Agent,
     batch: Transition,
-    discount: jax.Array,
-    noise: jax.Array,
+    discount: Number,
+    noise: Float[Array, "B A"],
     *,
     nets: Networks,
-    bounds: tuple[jax.Array, jax.Array] | None = None,
-) -> tuple[jax.Array, jax.Array]:
-    """½ (Q - Q̂)² for both critics (equation 27), Q̂ within `bounds`, and the mean of Q over the batch. noise [B, A]."""
+    bounds: tuple[Number, Number] | None = None,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """½ (Q - Q̂)² for both critics (equation 27), Q̂ within `bounds`, and the mean of Q over the batch."""
     next_action, next_log_prob = nets.actor.law(agent.actor, batch.next_obs).reparameterized(noise)
     next_q = jnp.minimum(*nets.critic.values(agent.target_critic, batch.next_obs, next_action))
     alpha = jnp.exp(agent.log_alpha)
@@ -145,9 +153,15 @@ def critic_loss(
 
 
 def actor_loss(
-    actor: Params, critic: Params, alpha: jax.Array, obs: jax.Array, noise: jax.Array, *, nets: Networks
-) -> tuple[jax.Array, jax.Array]:
-    """E[α log π(a | s) - min Q(s, a)] (equations 25 and 28), and the mean log-probability. noise [B, A]."""
+    actor: Params,
+    critic: Params,
+    alpha: Number,
+    obs: Float[Array, "B O"],
+    noise: Float[Array, "B A"],
+    *,
+    nets: Networks,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """E[α log π(a | s) - min Q(s, a)] (equations 25 and 28), and the mean log-probability."""
     action, log_prob = nets.actor.law(actor, obs).reparameterized(noise)
     q = jnp.minimum(*nets.critic.values(critic, obs, action))
     return jnp.mean(alpha * log_prob - q), jnp.mean(log_prob)

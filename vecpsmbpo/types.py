@@ -11,11 +11,19 @@ from typing import Any, NamedTuple, Self
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Bool, Float, Int
 
 from vecpsmbpo.settings import Settings
 
+# Signatures give shapes in these letters, `*batch` for any leading axes: Float[Array, "*batch O"]. Tests check them
+# where functions are traced (tests/shapes.py); a run does not.
 Params = Any  # a pytree of arrays
-TerminationRule = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+Number = Float[Array, ""] | float
+Count = Int[Array, ""] | int
+Flag = Bool[Array, ""] | bool
+TerminationRule = Callable[
+    [Float[Array, "*batch O"], Float[Array, "*batch A"], Float[Array, "*batch O"]], Bool[Array, "*batch"]
+]
 
 
 @dataclass(frozen=True)

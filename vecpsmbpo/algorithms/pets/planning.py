@@ -5,6 +5,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from vecpsmbpo import dynamics
 from vecpsmbpo.algorithms.pets.settings import PetsSettings
@@ -15,16 +16,19 @@ SMOOTHING = 0.1  # of what the distribution was before an iteration, kept
 
 
 def cross_entropy(
-    value: Callable[[jax.Array, jax.Array], jax.Array], mean: jax.Array, key: jax.Array, settings: PetsSettings
-) -> jax.Array:
-    """The plan [H, A] around which the cross-entropy method ends up.
+    value: Callable[[Float[Array, "K H A"], PRNGKeyArray], Float[Array, " K"]],
+    mean: Float[Array, "H A"],
+    key: PRNGKeyArray,
+    settings: PetsSettings,
+) -> Float[Array, "H A"]:
+    """The plan around which the cross-entropy method ends up.
 
     Every iteration draws candidates from a normal distribution, truncated at two deviations and narrowed where it
     would leave [-1, 1], and moves it to the mean and variance of the best of them.
 
     Args:
-        value: (plans [K, H, A], key) -> what each is worth [K].
-        mean: [H, A], where to begin.
+        value: (plans, key) -> what each is worth.
+        mean: where to begin.
     """
 
     def iterate(carry, key):
@@ -46,9 +50,15 @@ def cross_entropy(
 
 
 def expected_returns(
-    models: Model, obs: jax.Array, plans: jax.Array, key: jax.Array, *, settings: PetsSettings, spec: EnvSpec
-) -> jax.Array:
-    """What each plan earns in the models, the mean over its particles: [K].
+    models: Model,
+    obs: Float[Array, " O"],
+    plans: Float[Array, "K H A"],
+    key: PRNGKeyArray,
+    *,
+    settings: PetsSettings,
+    spec: EnvSpec,
+) -> Float[Array, " K"]:
+    """What each plan earns in the models, the mean over its particles.
 
     Every particle starts from `obs`. The particles of a plan are spread evenly over the models; each stays in its own
     (TS∞), or, with `rollout_models=any`, they are shuffled before every step (TS1). A particle that terminates
@@ -56,8 +66,7 @@ def expected_returns(
 
     Args:
         models: leaves [N, ...].
-        obs: [O].
-        plans: [K, H, A]; each action is held for `plan_hold` steps.
+        plans: each action is held for `plan_hold` steps.
     """
     count, particles, n_models = plans.shape[0], settings.plan_particles, settings.n_models
     predict = partial(dynamics.predict, net=dynamics.network(settings, spec), spec=spec)

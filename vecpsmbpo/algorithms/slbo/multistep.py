@@ -5,13 +5,16 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from vecpsmbpo import dynamics, networks, optim, replay
 from vecpsmbpo.algorithms.slbo.settings import SlboSettings
-from vecpsmbpo.types import EnvSpec, Hyper, Model, Transition
+from vecpsmbpo.types import Count, EnvSpec, Hyper, Model, Transition
 
 
-def loss(model: Model, batch: Transition, follows: jax.Array, *, net: networks.GaussianMLP) -> jax.Array:
+def loss(
+    model: Model, batch: Transition, follows: Bool[Array, "B H"], *, net: networks.GaussianMLP
+) -> Float[Array, ""]:
     """Mean over h of ‖((ŝ_{h+1} - ŝ_h) - (s_{h+1} - s_h)) / σ_s, r̂_h - r_h‖, where ŝ_0 = s_0 and the model goes on from
     its own predictions.
 
@@ -20,7 +23,7 @@ def loss(model: Model, batch: Transition, follows: jax.Array, *, net: networks.G
 
     Args:
         batch: H consecutive rows, leaves [B, H, ...].
-        follows: [B, H] bool, whether the row continues the one before it; the rest of a broken sequence does not count.
+        follows: whether the row continues the one before it; the rest of a broken sequence does not count.
     """
     obs_size = batch.obs.shape[-1]
 
@@ -44,9 +47,9 @@ def loss(model: Model, batch: Transition, follows: jax.Array, *, net: networks.G
 
 
 def sequences(
-    real: jax.Array, rows: jax.Array, key: jax.Array, settings: SlboSettings, spec: EnvSpec
-) -> tuple[Transition, jax.Array]:
-    """A batch of H consecutive rows of D_E, leaves [B, H, ...], and where each continues the one before, [B, H].
+    real: Float[Array, "C F"], rows: Count, key: PRNGKeyArray, settings: SlboSettings, spec: EnvSpec
+) -> tuple[Transition, Bool[Array, "B H"]]:
+    """A batch of H consecutive rows of D_E, leaves [B, H, ...], and where each continues the one before.
 
     Rows do not say where episodes end; a row continues another when it starts where that one led.
     """
@@ -59,15 +62,15 @@ def sequences(
 
 def fit(
     model: Model,
-    real: jax.Array,
-    rows: jax.Array,
+    real: Float[Array, "C F"],
+    rows: Count,
     hyper: Hyper,
-    key: jax.Array,
+    key: PRNGKeyArray,
     *,
     settings: SlboSettings,
     spec: EnvSpec,
 ) -> Model:
-    """The model after `model_steps` of Adam. real: D_E, [C, F], of which `rows` were added."""
+    """The model after `model_steps` of Adam. real: D_E, of which `rows` were added."""
     net = dynamics.network(settings, spec)
 
     def step(carry, key):

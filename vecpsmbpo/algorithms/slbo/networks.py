@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from vecpsmbpo.types import Params
 
@@ -17,7 +18,7 @@ class TanhMLP(nn.Module):
     hidden_layers: int
 
     @nn.compact
-    def __call__(self, hidden: jax.Array) -> jax.Array:
+    def __call__(self, hidden: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         for _ in range(self.hidden_layers):
             hidden = nn.tanh(nn.Dense(self.hidden_size, kernel_init=nn.initializers.orthogonal(2**0.5))(hidden))
         return nn.Dense(self.output_size, kernel_init=nn.initializers.orthogonal(0.01))(hidden)
@@ -29,20 +30,18 @@ class Normal(NamedTuple):
     loc: jax.Array
     log_std: jax.Array
 
-    def sample(self, key: jax.Array) -> jax.Array:
+    def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
         return self.loc + jnp.exp(self.log_std) * jax.random.normal(key, self.loc.shape)
 
-    def log_prob(self, action: jax.Array) -> jax.Array:
-        """[...]."""
+    def log_prob(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
         scaled = (action - self.loc) * jnp.exp(-self.log_std)
         return jnp.sum(-0.5 * scaled**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
-    def entropy(self) -> jax.Array:
-        """[...]."""
+    def entropy(self) -> Float[Array, "*batch"]:
         return jnp.sum(jnp.broadcast_to(self.log_std, self.loc.shape) + 0.5 * jnp.log(2 * jnp.pi * jnp.e), axis=-1)
 
-    def divergence_to(self, other: "Normal") -> jax.Array:
-        """KL(self || other), [...]."""
+    def divergence_to(self, other: "Normal") -> Float[Array, "*batch"]:
+        """KL(self || other)."""
         ratio = jnp.exp(2 * (self.log_std - other.log_std))
         distance = ((self.loc - other.loc) * jnp.exp(-other.log_std)) ** 2
         return 0.5 * jnp.sum(ratio + distance - 1 - 2 * (self.log_std - other.log_std), axis=-1)
@@ -56,13 +55,13 @@ class GaussianPolicy(nn.Module):
     hidden_layers: int
 
     @nn.compact
-    def __call__(self, obs: jax.Array) -> Normal:
-        """obs [..., O] -> law of actions [..., A]."""
+    def __call__(self, obs: Float[Array, "*batch O"]) -> Normal:
+        """The law of actions."""
         loc = TanhMLP(self.action_size, self.hidden_size, self.hidden_layers)(obs)
         log_std = self.param("log_std", nn.initializers.constant(-0.5), (self.action_size,))
         return Normal(loc, jnp.broadcast_to(log_std, loc.shape))
 
-    def law(self, params: Params, obs: jax.Array) -> Normal:
+    def law(self, params: Params, obs: Float[Array, "*batch O"]) -> Normal:
         """π(· | obs) of these parameters."""
         law: Any = self.apply(params, obs)
         return law
@@ -75,11 +74,10 @@ class StateValue(nn.Module):
     hidden_layers: int
 
     @nn.compact
-    def __call__(self, obs: jax.Array) -> jax.Array:
-        """obs [..., O] -> [...]."""
+    def __call__(self, obs: Float[Array, "*batch O"]) -> Float[Array, "*batch"]:
         return TanhMLP(1, self.hidden_size, self.hidden_layers)(obs)[..., 0]
 
-    def values(self, params: Params, obs: jax.Array) -> jax.Array:
-        """V [...] of these parameters."""
+    def values(self, params: Params, obs: Float[Array, "*batch O"]) -> Float[Array, "*batch"]:
+        """V of these parameters."""
         values: Any = self.apply(params, obs)
         return values

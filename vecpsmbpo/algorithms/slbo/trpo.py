@@ -7,11 +7,12 @@ import jax.numpy as jnp
 from flax import struct
 from jax.flatten_util import ravel_pytree
 from jax.scipy.sparse.linalg import cg
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from vecpsmbpo import optim
 from vecpsmbpo.algorithms.slbo import networks
 from vecpsmbpo.algorithms.slbo.settings import SlboSettings
-from vecpsmbpo.types import EnvSpec, Params, Stats
+from vecpsmbpo.types import EnvSpec, Number, Params, Stats
 
 DAMPING = 0.1  # added to the Fisher matrix
 CG_ITERATIONS = 10
@@ -64,7 +65,7 @@ def make_networks(settings: SlboSettings, spec: EnvSpec) -> Networks:
     return Networks(networks.GaussianPolicy(spec.action_size, size, layers), networks.StateValue(size, layers))
 
 
-def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> TrpoAgent:
+def init(key: PRNGKeyArray, nets: Networks, spec: EnvSpec) -> TrpoAgent:
     policy_key, value_key = jax.random.split(key)
     obs = jnp.zeros(spec.obs_size)
     value = nets.value.init(value_key, obs)
@@ -72,18 +73,15 @@ def init(key: jax.Array, nets: Networks, spec: EnvSpec) -> TrpoAgent:
 
 
 def advantages(
-    reward: jax.Array,
-    value: jax.Array,
-    next_value: jax.Array,
-    terminated: jax.Array,
-    ended: jax.Array,
-    discount: jax.Array,
+    reward: Float[Array, "T B"],
+    value: Float[Array, "T B"],
+    next_value: Float[Array, "T B"],
+    terminated: Float[Array, "T B"],
+    ended: Bool[Array, "T B"],
+    discount: Number,
     decay: float,
-) -> jax.Array:
-    """Generalized advantages Σ_l (γ λ)^l δ_{t+l} within a rollout, where δ = r + γ (1 - terminated) V(s') - V(s).
-
-    All [T, B].
-    """
+) -> Float[Array, "T B"]:
+    """Generalized advantages Σ_l (γ λ)^l δ_{t+l} within a rollout, where δ = r + γ (1 - terminated) V(s') - V(s)."""
     delta = reward + discount * (1 - terminated) * next_value - value
 
     def backwards(following, xs):
@@ -95,8 +93,8 @@ def advantages(
 
 
 def surrogate(
-    policy: Params, old_log_prob: jax.Array, rows: Any, entropy_weight: float, *, nets: Networks
-) -> jax.Array:
+    policy: Params, old_log_prob: Float[Array, " K"], rows: Any, entropy_weight: float, *, nets: Networks
+) -> Float[Array, ""]:
     """E[π / π_old · advantage] and the entropy bonus. rows: (obs [K, O], action [K, A], advantage [K])."""
     obs, action, advantage = rows
     law = nets.policy.law(policy, obs)
@@ -104,17 +102,15 @@ def surrogate(
     return jnp.mean(ratio * advantage) + entropy_weight * jnp.mean(law.entropy())
 
 
-def divergence(policy: Params, old: Params, obs: jax.Array, *, nets: Networks) -> jax.Array:
-    """Mean KL(π_old || π) over obs [K, O]."""
+def divergence(policy: Params, old: Params, obs: Float[Array, "K O"], *, nets: Networks) -> Float[Array, ""]:
+    """Mean KL(π_old || π) over `obs`."""
     return jnp.mean(nets.policy.law(old, obs).divergence_to(nets.policy.law(policy, obs)))
 
 
-def natural_direction(policy: Params, gradient: jax.Array, obs: jax.Array, *, nets: Networks) -> tuple[Any, Any]:
-    """(F + damping)⁻¹ gradient by conjugate gradients, and F + damping as a function; F is the Hessian of the KL.
-
-    Args:
-        gradient: flat, [D].
-    """
+def natural_direction(
+    policy: Params, gradient: Float[Array, " D"], obs: Float[Array, "K O"], *, nets: Networks
+) -> tuple[Float[Array, " D"], Any]:
+    """(F + damping)⁻¹ gradient by conjugate gradients, and F + damping as a function; F is the Hessian of the KL."""
     flat, unravel = ravel_pytree(policy)
     slope = jax.grad(lambda x: divergence(unravel(x), policy, obs, nets=nets))
 
@@ -126,7 +122,7 @@ def natural_direction(policy: Params, gradient: jax.Array, obs: jax.Array, *, ne
 
 def policy_step(
     policy: Params, rows: Any, *, trust_region: float, entropy_weight: float, nets: Networks
-) -> tuple[Params, jax.Array]:
+) -> tuple[Params, Float[Array, ""]]:
     """The policy after one step that improves the surrogate and stays within the trust region, or the same policy where
     no step of the line search does; and by how much the surrogate grew.
 
@@ -158,7 +154,7 @@ def policy_step(
 
 
 def update(
-    agent: TrpoAgent, rollouts: Rollouts, discount: jax.Array, key: jax.Array, *, settings: SlboSettings, nets: Networks
+    agent: TrpoAgent, rollouts: Rollouts, discount: Number, key: PRNGKeyArray, *, settings: SlboSettings, nets: Networks
 ) -> TrpoAgent:
     """One step of the policy, and the value function refitted to the rollouts' returns."""
     value, next_value = (nets.value.values(agent.value, obs) for obs in (rollouts.obs, rollouts.next_obs))
