@@ -41,7 +41,7 @@ def algorithm(settings: Settings, spec: EnvSpec) -> Any:
 def initial(algorithm: Algorithm) -> SeedState:
     """The state of all seeds before the first step."""
     specs = algorithm.layout.specs().seeds
-    init = algorithm.layout.spread(jax.vmap(algorithm.init), (specs.key, specs.key), specs)
+    init = algorithm.layout.jit_shard_map(jax.vmap(algorithm.init), (specs.key, specs.key), specs)
     return init(*initial_inputs(algorithm.settings))
 
 

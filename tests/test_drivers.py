@@ -10,7 +10,7 @@ import pytest
 
 from tests import probes
 from tests.helpers import algorithm, assert_probabilities_follow, tiny
-from vecpsmbpo import metrics, replay, sac
+from vecpsmbpo import metrics, placement, replay, sac
 from vecpsmbpo.algorithms.catalogue import of_algorithm
 from vecpsmbpo.drivers import HostDriver, ScanDriver
 from vecpsmbpo.drivers.common import split_for_episodes
@@ -86,14 +86,14 @@ def _value(driver, state, member, obs):
     nets = sac.make_networks(driver.settings, driver.algorithm.spec)
     agent = jax.tree.map(lambda x: x[0, member], state.seeds.agents)
     obs = jnp.array([obs])
-    return float(jnp.minimum(*nets.critic.values(agent.critic, obs, nets.actor.law(agent.actor, obs).mode())))
+    return float(jnp.minimum(*nets.critic.values(agent.critic, obs, nets.actor.distribution(agent.actor, obs).mode())))
 
 
 def test_policies_are_optimal(trained):
     settings, driver, _, state, _ = trained
     nets = sac.make_networks(settings, driver.algorithm.spec)
     actors = jax.tree.map(lambda x: x[0], state.seeds.agents.actor)
-    actions = jax.vmap(lambda actor: nets.actor.law(actor, jnp.ones(1)).mode())(actors)
+    actions = jax.vmap(lambda actor: nets.actor.distribution(actor, jnp.ones(1)).mode())(actors)
     assert np.abs(actions[: settings.n_members]).max() < 0.35  # reward 1 - a²: at least 0.88 of the best
 
 
@@ -218,7 +218,7 @@ def _four_policies(settings, driver):
     actor["params"]["ReluMLP_0"]["Dense_2"]["bias"] = bias
     posterior = state.seeds.posterior.replace(returns=jnp.array([[0.0, 9e9, 0, 0]]), episodes=jnp.ones((1, 4), int))
     seeds = state.seeds.replace(agents=state.seeds.agents.replace(actor=actor), posterior=posterior)
-    return driver.layout.place(state.replace(seeds=seeds))
+    return placement.place(driver.layout, state.replace(seeds=seeds))
 
 
 ACTIONS = np.tanh(np.arange(4) / 4)  # of which the probe rewards 1 - a²

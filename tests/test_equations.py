@@ -219,7 +219,7 @@ def test_losses_take_the_smaller_of_the_two_critics(values, key, agent):
     noise = jax.random.normal(key, batch.action.shape)
     loss, log_prob = sac.actor_loss(agent.actor, _answering(agent.critic, *values), alpha, batch.obs, noise, nets=nets)
     assert loss == pytest.approx(0.5 * float(log_prob) - 2, abs=1e-5)
-    _, log_prob = nets.actor.law(agent.actor, batch.next_obs).sample(key)
+    _, log_prob = nets.actor.distribution(agent.actor, batch.next_obs).sample(key)
     target = 1 + 0.9 * (2 - 0.5 * np.asarray(log_prob))
     learner = agent.replace(target_critic=_answering(agent.critic, *values), log_alpha=jnp.log(alpha))
     loss, _ = sac.critic_loss(_answering(agent.critic, 0.0, 1.0), learner, batch, jnp.float32(0.9), noise, nets=nets)

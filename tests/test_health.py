@@ -18,7 +18,7 @@ import pytest
 from tests import probes
 from tests.helpers import algorithm, argv, initial, tiny
 from tests.test_resume import without_times
-from vecpsmbpo import checkpoint, evaluate, health, jsonl, replay, training
+from vecpsmbpo import checkpoint, evaluate, health, jsonl, placement, replay, training
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.training import programs
@@ -62,7 +62,7 @@ def killed_at(step: int, settings: Settings, monkeypatch: pytest.MonkeyPatch) ->
 
 def final(settings: Settings) -> TrainState:
     driver, saved = evaluate.restore(settings)
-    return driver.layout.unpad(saved.state)
+    return placement.unpad(driver.layout, saved.state)
 
 
 def leaves_of(tree, lanes) -> list[np.ndarray]:
@@ -266,7 +266,7 @@ def settled():
     assert layout.padded_members == 4
     specs = layout.specs()
     state = TrainState(Counters(jnp.int32(100), jnp.int32(0)), initial(learner), jnp.zeros((1, 1)))
-    end = layout.spread(partial(health.settle, layout), (specs.without_rings(), specs), (specs, specs.env))
+    end = layout.jit_shard_map(partial(health.settle, layout), (specs.without_rings(), specs), (specs, specs.env))
     return settings, state, end
 
 

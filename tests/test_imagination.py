@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from tests.helpers import algorithm, initial, tiny
-from vecpsmbpo import health, replay
+from vecpsmbpo import health, placement, replay
 from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.types import Counters, EnvSpec, Transition
 
@@ -37,7 +37,7 @@ def imagine(settings, change=1.0):
     learner = algorithm(settings, SPEC)
     layout = learner.layout
     specs = layout.specs()
-    state = layout.unpad(_train_state(initial(learner)))
+    state = placement.unpad(layout, _train_state(initial(learner)))
     seeds = state.seeds
 
     def model_params(n):
@@ -53,8 +53,8 @@ def imagine(settings, change=1.0):
         agents=seeds.agents.replace(actor={"params": {"ReluMLP_0": inner}}),
         real=_real_rows(seeds.real),
     )
-    placed = layout.place(state.replace(seeds=seeds)).seeds
-    run = layout.spread(
+    placed = placement.place(layout, state.replace(seeds=seeds)).seeds
+    run = layout.jit_shard_map(
         lambda counters, seeds, keys: over_seeds(
             lambda c, s, k: learner.imagine(c, s, jnp.bool_(True), k), out_axes=(None, 0)
         )(counters, seeds, keys),

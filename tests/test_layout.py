@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import algorithm, environment, initial, tiny
-from vecpsmbpo import sac
+from vecpsmbpo import placement, sac
 from vecpsmbpo.envs import specs
 from vecpsmbpo.layout import MEMBER_WORK, Layout, _copies, _mesh_shape
 from vecpsmbpo.schedule import over_seeds
@@ -28,13 +28,13 @@ def learned(settings, layout):
     noise = jax.random.normal(jax.random.key(3), state.real.shape[1:])
     row = jax.random.normal(jax.random.key(4), state.imagined.shape[2:])
     state = state.replace(real=state.real + noise, imagined=state.imagined + row)
-    run = layout.spread(
+    run = layout.jit_shard_map(
         lambda c, s: s.replace(agents=over_seeds(learner.learn)(c, s, s.key)),
         (specs_.counters, specs_.seeds),
         specs_.seeds,
     )
     counters = Counters(jnp.int32(100), jnp.int32(16))
-    return layout.unpad(TrainState(counters, run(counters, state), jnp.zeros((1, 1)))).seeds
+    return placement.unpad(layout, TrainState(counters, run(counters, state), jnp.zeros((1, 1)))).seeds
 
 
 def _close(a, b, atol=2e-5):
@@ -103,9 +103,9 @@ def test_place_is_the_inverse_of_unpad():
     learner = algorithm(settings, SPEC)
     counters = Counters(jnp.int32(0), jnp.int32(0))
     state = TrainState(counters, initial(learner), jnp.zeros((1, 2)))
-    plain = layout.unpad(state)
+    plain = placement.unpad(layout, state)
     assert plain.seeds.agents.log_alpha.shape == (1, 3)
-    again = layout.unpad(layout.place(plain))
+    again = placement.unpad(layout, placement.place(layout, plain))
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(plain), strict=True):
         if not jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
             np.testing.assert_array_equal(a, b)
@@ -121,10 +121,10 @@ def test_rings_come_back_from_the_host(seeds, models):
     for name, members in (("real", None), ("imagined", models)):
         empty, spec = getattr(seeds_state, name), getattr(layout.specs().seeds, name)
         values = np.random.default_rng(0).normal(size=empty.shape).astype(np.float32)
-        rings = layout.rings_to_host(jax.device_put(values, empty.sharding))
+        rings = placement.rings_to_host(layout, jax.device_put(values, empty.sharding))
         expected = values if members is None else values[:, :members]
         np.testing.assert_array_equal(np.reshape(rings, expected.shape), expected)
-        again = layout.rings_from_host(rings, empty, spec)
+        again = placement.rings_from_host(layout, rings, empty, spec)
         assert again.sharding == empty.sharding
         assert rings == [None] * len(rings)
         np.testing.assert_array_equal(again if members is None else again[:, :members], expected)
@@ -136,7 +136,7 @@ def test_saving_rings_leaves_them_to_be_overwritten_in_place():
     ring = initial(algorithm(tiny(devices=2), SPEC)).imagined
     shards = lambda x: [shard.data.unsafe_buffer_pointer() for shard in x.addressable_shards]  # noqa: E731
     before = shards(ring)
-    assert len(layout.rings_to_host(ring)) == 4
+    assert len(placement.rings_to_host(layout, ring)) == 4
     after = jax.jit(lambda x: x.at[..., 0].set(1.0), donate_argnums=0, out_shardings=ring.sharding)(ring)
     assert shards(after) == before
 
@@ -202,7 +202,7 @@ from vecpsmbpo.layout import Layout
 
 jax.config.update("jax_num_cpu_devices", 2)
 layout = Layout(Mesh(np.array(jax.devices()).reshape(2, 1), ("seeds", "members")), 2, 1, 1, 1, True)
-ours = lambda body, specs: layout.spread(body, specs, P("seeds"))
+ours = lambda body, specs: layout.jit_shard_map(body, specs, P("seeds"))
 jaxs = lambda body, specs: jax.jit(jax.shard_map(body, mesh=layout.mesh, in_specs=specs, out_specs=P("seeds")))
 x, nothing = jnp.arange(4.0), jnp.zeros((4, 0))
 cases = {
@@ -228,5 +228,5 @@ def test_arrays_without_elements_may_come_from_outside_of_the_program(case):
 
 @pytest.mark.skipif(jax.__version_info__ < (0, 11), reason="it came with jax 0.11")
 def test_jaxs_own_shard_map_still_crashes_on_them():
-    """Where this fails, `Layout.spread` need no longer make them inside (docs/architecture.md)."""
+    """Where this fails, `Layout.jit_shard_map` need no longer make them inside (docs/architecture.md)."""
     assert with_empty_arrays("jax's", "captured") == -11

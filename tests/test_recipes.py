@@ -132,7 +132,7 @@ def test_policies_learn_with_the_rate_of_the_step(key):
     learner = algorithm(tiny(n_models=1, n_policies=1, updates_per_step=1, **changes), specs.get("hopper"))
     states, layout = initial(learner), learner.layout
     learn = over_seeds(lambda counters, state: learner.learn(counters, state, state.key))
-    program = layout.spread(learn, (layout.specs().counters, layout.specs().seeds), layout.specs().seeds.agents)
+    program = layout.jit_shard_map(learn, (layout.specs().counters, layout.specs().seeds), layout.specs().seeds.agents)
 
     def length(steps):
         agents = program(Counters(jnp.int32(steps), jnp.int32(16)), states)

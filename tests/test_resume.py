@@ -17,7 +17,7 @@ import pytest
 
 import vecpsmbpo
 from tests.helpers import argv, assert_probabilities_follow, check_log, command, environment, tiny
-from vecpsmbpo import config, evaluate, jsonl, metrics, recorded, training
+from vecpsmbpo import config, evaluate, jsonl, metrics, placement, recorded, training
 from vecpsmbpo.envs.host.dm_control import DmControlSimulator
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.training import guards
@@ -30,7 +30,7 @@ def final_parameters(run_dir: Path) -> list[np.ndarray]:
     settings = config.load(run_dir)
     driver, saved = evaluate.restore(settings)
     assert saved.step == settings.total_steps
-    leaves = jax.tree.leaves(driver.layout.unpad(saved.state))
+    leaves = jax.tree.leaves(placement.unpad(driver.layout, saved.state))
     is_key = lambda x: jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
     return [np.asarray(jax.random.key_data(leaf) if is_key(leaf) else leaf) for leaf in leaves]
 
@@ -180,7 +180,7 @@ def test_a_policy_is_loaded_from_a_run(posterior, short_run, tmp_path, monkeypat
     settings, act = run.settings, run.policy
     assert settings == config.load(tmp_path / "run")
     driver, saved = evaluate.restore(settings)
-    seeds = driver.layout.unpad(saved.state).seeds
+    seeds = placement.unpad(driver.layout, saved.state).seeds
     layers = jax.tree.map(lambda x: np.asarray(x[0], float), seeds.agents.actor)["params"]["ReluMLP_0"]
     obs = np.random.default_rng(0).normal(size=(3, 8))
 

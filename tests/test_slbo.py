@@ -27,16 +27,16 @@ def policy(key):
     return jax.tree.map(lambda x: x + 0.3 * jax.random.normal(key, x.shape), params)
 
 
-# ── the policy's law ─────────────────────────────────────────────────────────────────────────────────────────────
+# ── the policy's distribution ────────────────────────────────────────────────────────────────────────────────────
 
 
 def test_normal_against_scipy():
     random = np.random.default_rng(0)
     loc, log_std, action = random.normal(size=(3, 50, 2))
-    law = networks.Normal(jnp.asarray(loc), jnp.asarray(log_std))
+    distribution = networks.Normal(jnp.asarray(loc), jnp.asarray(log_std))
     theirs = scipy.stats.norm(loc, np.exp(log_std))
-    np.testing.assert_allclose(law.log_prob(jnp.asarray(action)), theirs.logpdf(action).sum(-1), rtol=1e-4)
-    np.testing.assert_allclose(law.entropy(), theirs.entropy().sum(-1), rtol=1e-4)
+    np.testing.assert_allclose(distribution.log_prob(jnp.asarray(action)), theirs.logpdf(action).sum(-1), rtol=1e-4)
+    np.testing.assert_allclose(distribution.entropy(), theirs.entropy().sum(-1), rtol=1e-4)
 
 
 def test_divergence_of_normals_by_monte_carlo():
@@ -72,8 +72,11 @@ def test_the_natural_direction_against_a_dense_solve(policy, key):
 
     # The Fisher matrix from its definition: E[J' F_law J], F_law = diag(1 / σ²) for the mean and 2 for log σ.
     def outputs(x):
-        law = NETS.policy.law(unravel(x), obs)
-        return jnp.concatenate([law.loc * jnp.exp(-jax.lax.stop_gradient(law.log_std)), 2**0.5 * law.log_std], -1)
+        distribution = NETS.policy.distribution(unravel(x), obs)
+        return jnp.concatenate(
+            [distribution.loc * jnp.exp(-jax.lax.stop_gradient(distribution.log_std)), 2**0.5 * distribution.log_std],
+            -1,
+        )
 
     jacobian = np.asarray(jax.jacobian(outputs)(flat), np.float64)
     dense = np.einsum("bij,bik->jk", jacobian, jacobian) / len(obs) + trpo.DAMPING * np.eye(flat.size)
@@ -87,15 +90,15 @@ def test_the_natural_direction_against_a_dense_solve(policy, key):
 def test_a_step_improves_the_surrogate_within_the_trust_region(policy, key):
     keys = jax.random.split(key, 3)
     obs = jax.random.normal(keys[0], (512, SPEC.obs_size))
-    law = NETS.policy.law(policy, obs)
-    action = law.sample(keys[1])
+    distribution = NETS.policy.distribution(policy, obs)
+    action = distribution.sample(keys[1])
     advantage = -jnp.sum((action - 0.5) ** 2, axis=-1)  # actions near 0.5 are good
     rows = obs, action, (advantage - advantage.mean()) / advantage.std()
     for region in (0.001, 0.01, 0.1):
         after, gain = trpo.policy_step(policy, rows, trust_region=region, entropy_weight=0.0, nets=NETS)
         moved = float(trpo.divergence(after, policy, obs, nets=NETS))
         assert 0.2 * region < moved <= region * 1.001
-        old = law.log_prob(action)
+        old = distribution.log_prob(action)
         gained = trpo.surrogate(after, old, rows, 0.0, nets=NETS) - trpo.surrogate(policy, old, rows, 0.0, nets=NETS)
         assert 0 < float(gained) == pytest.approx(float(gain), abs=1e-5)
 
@@ -103,7 +106,7 @@ def test_a_step_improves_the_surrogate_within_the_trust_region(policy, key):
 def test_without_a_better_step_the_policy_stays(policy, key):
     """No advantage anywhere: there is nothing to gain."""
     obs = jax.random.normal(key, (32, SPEC.obs_size))
-    action = NETS.policy.law(policy, obs).sample(key)
+    action = NETS.policy.distribution(policy, obs).sample(key)
     after, gain = trpo.policy_step(
         policy, (obs, action, jnp.zeros(32)), trust_region=0.01, entropy_weight=0.0, nets=NETS
     )

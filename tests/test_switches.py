@@ -328,7 +328,7 @@ def valued():
     """Members drawn by what their critics promise: settings, driver, state, episodes, and values of a state's seed."""
     settings, driver, state, lines, _ = run(weights="values", temperature=0.1)
     parts = driver.layout.specs().seeds
-    values = driver.layout.spread(jax.vmap(driver.algorithm.values), (parts,), parts.key)
+    values = driver.layout.jit_shard_map(jax.vmap(driver.algorithm.values), (parts,), parts.key)
     return settings, driver.algorithm.spec, state, lines, lambda seeds: values(seeds)[0]
 
 
@@ -344,7 +344,7 @@ def test_members_may_be_drawn_by_what_their_critics_promise(valued):
     nets, start = sac.make_networks(settings, spec), jnp.zeros(1)  # where every episode begins
     for member, found in enumerate(values(state.seeds)):
         agent = jax.tree.map(lambda x, member=member: x[0, member], state.seeds.agents)
-        action = np.tanh(nets.actor.law(agent.actor, start).loc)
+        action = np.tanh(nets.actor.distribution(agent.actor, start).loc)
         by_hand = np.min(nets.critic.values(agent.critic, start, action))
         assert found == pytest.approx(max(by_hand, 0.0), rel=1e-4)
 
@@ -383,7 +383,7 @@ def test_the_average_s_actions_come_from_all_members(key):
         return jax.vmap(lambda key: learner.act(counters, state, jnp.zeros(1), key)[0])(keys)
 
     shared = learner.layout.specs().counters
-    actions = learner.layout.spread(act, (shared, shared), shared)(Counters(jnp.int32(0), jnp.int32(0)), key)
+    actions = learner.layout.jit_shard_map(act, (shared, shared), shared)(Counters(jnp.int32(0), jnp.int32(0)), key)
     which = np.rint(np.arctanh(np.asarray(actions)[:, 0]) * 4).astype(int)
     assert scipy.stats.chisquare(np.bincount(which, minlength=4)).pvalue > 1e-3
 

@@ -112,7 +112,7 @@ def seconds_per_update(driver: ScanDriver, state: TrainState, repeats: int) -> f
 
         return jax.lax.scan(step, state.seeds, jnp.arange(steps))[0].agents
 
-    run = driver.layout.spread(body, (specs,), specs.seeds.agents)
+    run = driver.layout.jit_shard_map(body, (specs,), specs.seeds.agents)
     jax.block_until_ready(run(state))
     return best_seconds(lambda: run(state), repeats) / steps
 
@@ -281,7 +281,7 @@ def seconds_per_refresh(driver: ScanDriver, state: TrainState) -> float:
         imagine = lambda counters, seed, key: algorithm.imagine(counters, seed, jnp.bool_(True), key)[1]  # noqa: E731
         return over_seeds(imagine)(state.counters, state.seeds, state.seeds.key).imagined
 
-    run = driver.layout.spread(body, (specs,), specs.seeds.imagined)
+    run = driver.layout.jit_shard_map(body, (specs,), specs.seeds.imagined)
     jax.block_until_ready(run(state))
     return best_seconds(lambda: run(state), 2)
 

@@ -6,6 +6,7 @@ import logging
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import type_handlers
 
-from vecpsmbpo import recorded
+from vecpsmbpo import placement, recorded
 from vecpsmbpo.algorithms import TABLE
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import SettingError, Settings
@@ -171,9 +172,9 @@ def _arrays_sum(plain: dict[str, Any]) -> int:
 
 
 def _to_host(state: TrainState, layout: Layout) -> dict[str, Any]:
-    rest = jax.tree.map(lambda x: np.asarray(_storable(x)), layout.unpad(state.without_rings()))
-    real = layout.rings_to_host(state.seeds.real)
-    imagined = layout.rings_to_host(state.seeds.imagined)
+    rest = jax.tree.map(lambda x: np.asarray(_storable(x)), placement.unpad(layout, state.without_rings()))
+    real = placement.rings_to_host(layout, state.seeds.real)
+    imagined = placement.rings_to_host(layout, state.seeds.imagined)
     return {"rest": rest, "real": real, "imagined": imagined}
 
 
@@ -183,18 +184,18 @@ def _shapes_on_host(shapes: TrainState, layout: Layout) -> dict[str, Any]:
     def rings(like: Any, count: int) -> list[Any]:
         return [jax.ShapeDtypeStruct(like.shape[-2:], like.dtype)] * count
 
-    rest = jax.eval_shape(lambda state: jax.tree.map(_storable, layout.unpad(state)), shapes.without_rings())
+    rest = jax.eval_shape(lambda state: jax.tree.map(_storable, placement.unpad(layout, state)), shapes.without_rings())
     seeds, count = shapes.seeds, layout.num_seeds
     return {"rest": rest, "real": rings(seeds.real, count), "imagined": rings(seeds.imagined, count * layout.n_members)}
 
 
 def _from_host(plain: dict[str, Any], shapes: TrainState, layout: Layout) -> TrainState:
     """The inverse of `_to_host`; takes the rings out of `plain`."""
-    rest_shapes = jax.eval_shape(layout.unpad, shapes.without_rings())
-    state = layout.place(jax.tree.map(_restored, plain["rest"], rest_shapes))
+    rest_shapes = jax.eval_shape(partial(placement.unpad, layout), shapes.without_rings())
+    state = placement.place(layout, jax.tree.map(_restored, plain["rest"], rest_shapes))
     specs = layout.specs().seeds
     rings = {
-        name: layout.rings_from_host(plain[name], getattr(shapes.seeds, name), getattr(specs, name))
+        name: placement.rings_from_host(layout, plain[name], getattr(shapes.seeds, name), getattr(specs, name))
         for name in ("real", "imagined")
     }
     return state.replace(seeds=state.seeds.replace(**rings))

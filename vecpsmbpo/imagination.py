@@ -99,7 +99,7 @@ def step(
         Transition with leaves [B, ...]; the policy's sampled action, the model's sampled successor, reward and end.
     """
     action_key, model_key = jax.random.split(key)
-    action, _ = sac.make_networks(settings, spec).actor.law(actor, obs).sample(action_key)
+    action, _ = sac.make_networks(settings, spec).actor.distribution(actor, obs).sample(action_key)
     net = dynamics.network(settings, spec)
     predict = partial(dynamics.predict, net=net, spec=spec)
     if settings.rollout_models == "any":

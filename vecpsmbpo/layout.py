@@ -6,9 +6,8 @@ it, and the few values that cross it (the acting policy's action, the models) ar
 cores, one GPU and eight GPUs are the same program on a different mesh.
 """
 
-import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -149,7 +148,7 @@ class Layout:
         members = self.member_ids().shape[0]
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), self.all_models(models))
 
-    def share(self, function: Callable[[jax.Array, jax.Array], jax.Array], items: jax.Array) -> jax.Array:
+    def map_sharded(self, function: Callable[[jax.Array, jax.Array], jax.Array], items: jax.Array) -> jax.Array:
         """`function` of (items [K', ...], their indices [K']) -> [K'], each device doing its part of the K: [K].
 
         The same `items` are on every device, and so is the answer.
@@ -159,7 +158,7 @@ class Layout:
         ids = jnp.minimum(jax.lax.axis_index(MEMBERS) * local + jnp.arange(local), count - 1)
         return _everywhere(function(items[ids], ids))[:count]
 
-    def ask(self, member: jax.Array, tree: Any, function: Callable = lambda params: params) -> Any:
+    def select_member(self, member: jax.Array, tree: Any, function: Callable = lambda params: params) -> Any:
         """`function` of the leaves [...] that `member` has in `tree` [P_local, ...]: computed by every device for one
         of its own members, taken from the device where `member` lives."""
         local = self.padded_members // self.shards
@@ -214,7 +213,7 @@ class Layout:
         shared: Any = PartitionSpec()
         return TrainState(counters=shared, seeds=SeedState(**parts), env=_BY_SEED)
 
-    def spread(self, function: Callable, in_specs: Any, out_specs: Any, **jit: Any) -> Any:
+    def jit_shard_map(self, function: Callable, in_specs: Any, out_specs: Any, **jit: Any) -> Any:
         """`function` of a device's part, jitted over the whole mesh."""
         # Replication along `members` holds by construction (equal inputs, equal programs); jax's static check of it
         # cannot follow MJX's while loops.
@@ -233,93 +232,14 @@ class Layout:
         specs = jax.tree.broadcast(self.specs(), state, is_leaf=lambda x: isinstance(x, PartitionSpec))
         return self._placed(specs)
 
-    def unpad(self, state: TrainState) -> TrainState:
-        """`state` without the padding members and models: what a checkpoint holds, whatever mesh it came from."""
-        return self._rearranged(state, np.arange(self.n_models), self.places_of_members)
-
-    def place(self, state: TrainState) -> TrainState:
-        """An unpadded state, padded to this mesh and laid out on it."""
-        # Padding repeats what there is: any valid numbers do.
-        models = np.arange(self.padded_models) % self.n_models
-        padded = self._rearranged(state, models, self._members_at_places() % self.n_members)
-        return jax.device_put(padded, self.shardings(padded))
-
     @property
     def places_of_members(self) -> np.ndarray:
         """[N·M] where on the axis [P] each member lies, first."""
         return np.arange(self.n_members) * self.copies
 
-    def _members_at_places(self) -> np.ndarray:
+    def members_at_places(self) -> np.ndarray:
         """[P] which member lies there; from N·M on, padding."""
         return np.arange(self.padded_members) // self.copies
-
-    def _rearranged(self, state: TrainState, models: np.ndarray, members: np.ndarray) -> TrainState:
-        """`state` with these of its models and these of its members."""
-        seeds = state.seeds
-
-        def chosen(tree: Any, which: np.ndarray) -> Any:
-            return jax.tree.map(lambda x: x if x.shape[1] == len(which) else x[:, which], tree)
-
-        return state.replace(
-            seeds=seeds.replace(
-                models=chosen(seeds.models, models),
-                agents=chosen(seeds.agents, members),
-                imagined=chosen(seeds.imagined, members),
-            )
-        )
-
-    # rings on the host: gigabytes at the paper's size, which must not be copied to be saved
-
-    def rings_to_host(self, rings: jax.Array) -> list[np.ndarray]:
-        """Each ring [C, F] of [S, C, F], or of the N·M members in [S, P, C, F], by itself.
-
-        Views, where the host's memory is the device's.
-        """
-        by_place: dict[tuple[int, ...], np.ndarray] = {}
-        for shard in rings.addressable_shards:
-            part = _view(shard.data)
-            where: Any = shard.index
-            for inside, place in zip(np.ndindex(part.shape[:-2]), _places(where[:-2], rings.shape), strict=True):
-                by_place[place] = part[inside]
-        members = [self.places_of_members.tolist()] if rings.ndim == 4 else []
-        return [by_place[place] for place in itertools.product(range(self.num_seeds), *members)]
-
-    def rings_from_host(self, saved: list[Any], like: Any, spec: PartitionSpec) -> jax.Array:
-        """The inverse of `rings_to_host`, laid out on the mesh; padding members get empty rings.
-
-        Takes the rings out of `saved` one by one, so that they are never held twice.
-
-        Args:
-            like: shape and type of the result.
-            spec: how it lies on the mesh.
-        """
-        of_members = len(like.shape) == 4
-        owners = self._members_at_places().tolist()
-
-        def number(place: tuple[int, ...]) -> int | None:
-            """Which of `saved` lies at a place."""
-            if not of_members:
-                return place[0]
-            seed, member = place[0], owners[place[1]]
-            return seed * self.n_members + member if member < self.n_members else None
-
-        sharding = NamedSharding(self.mesh, spec)
-        replicas: dict[tuple[tuple[int, ...], ...], list[Any]] = {}
-        whole: Any = sharding.addressable_devices_indices_map(like.shape)
-        for device, where in whole.items():
-            replicas.setdefault(tuple(_places(where[:-2], like.shape)), []).append(device)
-        parts = []
-        for places, devices in replicas.items():
-            part = np.zeros((len(places), *like.shape[-2:]), like.dtype)
-            for row, place in zip(part, places, strict=True):
-                if (index := number(place)) is not None:
-                    assert saved[index] is not None, "devices come in the order of their places"
-                    row[:] = saved[index]
-                    if not of_members or (place[1] + 1) % self.copies == 0:  # the last that shares it
-                        saved[index] = None
-            part = part.reshape(sharding.shard_shape(like.shape))
-            parts += [jax.device_put(part, device) for device in devices]
-        return jax.make_array_from_single_device_arrays(like.shape, sharding, parts)
 
 
 def _making_empty_arrays(function: Callable) -> Callable:
@@ -364,20 +284,6 @@ def _copies(members: int, batch: int, shards: int) -> int:
     `batch` rows into equal parts that are worth it."""
     shared = shards // members
     return shared if shards == members * shared and batch % shared == 0 and batch // shared >= LEAST_PART else 1
-
-
-def _view(x: Any) -> np.ndarray:
-    """`x` on the host, and not copied if it is there already.
-
-    `np.asarray` would not copy either, but jax keeps its view as long as `x` lives: a program that is then given `x`
-    to overwrite copies it first.
-    """
-    return np.from_dlpack(x) if x.device.platform == "cpu" else np.asarray(x)
-
-
-def _places(where: tuple[slice, ...], shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-    """The indices that the slices `where` of an array of this shape hold, in order."""
-    return itertools.product(*(range(*piece.indices(size)) for piece, size in zip(where, shape, strict=False)))
 
 
 def _everywhere(x: jax.Array) -> jax.Array:

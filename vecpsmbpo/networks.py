@@ -147,7 +147,7 @@ class ReluMLP(nn.Module):
 
 
 class TanhGaussian(NamedTuple):
-    """The law of tanh(u), u ~ Normal(loc, scale²), independently per action.
+    """The distribution of tanh(u), u ~ Normal(loc, scale²), independently per action.
 
     Attributes:
         loc, scale: [..., A].
@@ -194,16 +194,16 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> TanhGaussian:
-        """The law of actions."""
+        """The distribution of actions."""
         mlp = ReluMLP(2 * self.action_size, self.hidden_size, self.hidden_layers, precision=self.precision)
         outputs = mlp(obs)
         loc, raw_scale = jnp.split(outputs, 2, axis=-1)
         return TanhGaussian(loc, nn.softplus(raw_scale) + MIN_SCALE, self.most)
 
-    def law(self, params: Params, obs: Float[Array, "*batch O"]) -> TanhGaussian:
+    def distribution(self, params: Params, obs: Float[Array, "*batch O"]) -> TanhGaussian:
         """π(· | obs) of these parameters."""
-        law: Any = self.apply(params, obs)
-        return law
+        distribution: Any = self.apply(params, obs)
+        return distribution
 
 
 class TwinCritic(nn.Module):

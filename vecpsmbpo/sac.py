@@ -142,7 +142,7 @@ def critic_loss(
     bounds: tuple[Number, Number] | None = None,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """½ (Q - Q̂)² for both critics (equation 27), Q̂ within `bounds`, and the mean of Q over the batch."""
-    next_action, next_log_prob = nets.actor.law(agent.actor, batch.next_obs).reparameterized(noise)
+    next_action, next_log_prob = nets.actor.distribution(agent.actor, batch.next_obs).reparameterized(noise)
     next_q = jnp.minimum(*nets.critic.values(agent.target_critic, batch.next_obs, next_action))
     alpha = jnp.exp(agent.log_alpha)
     target = target_value(batch.reward, batch.terminated, next_q, next_log_prob, alpha, discount)
@@ -162,7 +162,7 @@ def actor_loss(
     nets: Networks,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """E[α log π(a | s) - min Q(s, a)] (equations 25 and 28), and the mean log-probability."""
-    action, log_prob = nets.actor.law(actor, obs).reparameterized(noise)
+    action, log_prob = nets.actor.distribution(actor, obs).reparameterized(noise)
     q = jnp.minimum(*nets.critic.values(critic, obs, action))
     return jnp.mean(alpha * log_prob - q), jnp.mean(log_prob)
 

@@ -1,6 +1,6 @@
 """What every algorithm does: keep the real data, the models and the episodes, and decide who acts.
 
-Everything here runs inside `layout.Layout.spread`: models and agents are this device's share, [N_local, ...] and
+Everything here runs inside `layout.Layout.jit_shard_map`: models and agents are this device's share, [N_local, ...] and
 [P_local, ...]. `counters` are shared by all seeds.
 """
 

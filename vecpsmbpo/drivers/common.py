@@ -111,7 +111,7 @@ def compiled(programs: Sequence[tuple[Any, tuple]]) -> tuple[list[Any], float]:
 def evaluation_policies(algorithm: Algorithm) -> Callable:
     """Compiled (seeds, keys [S]) -> what `Algorithm.evaluation_action` needs of every seed, leaves [S, ...]."""
     seeds = algorithm.layout.specs().seeds
-    return algorithm.layout.spread(jax.vmap(algorithm.evaluation_policy), (seeds, BY_SEED), BY_SEED)
+    return algorithm.layout.jit_shard_map(jax.vmap(algorithm.evaluation_policy), (seeds, BY_SEED), BY_SEED)
 
 
 def evaluation_actions(
@@ -126,7 +126,7 @@ def evaluation_actions(
     return jax.vmap(partial(algorithm.evaluation_action, policy, step))(memory, obs, keys)
 
 
-def many(tree: Any, *counts: int) -> Any:
+def broadcast_leaves(tree: Any, *counts: int) -> Any:
     """Copies: leaves [...] -> [*counts, ...]."""
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (*counts, *x.shape)), tree)
 

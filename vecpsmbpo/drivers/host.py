@@ -17,10 +17,10 @@ from vecpsmbpo.drivers.common import (
     SHARED,
     Interrupted,
     Returns,
+    broadcast_leaves,
     compiled,
     evaluation_actions,
     evaluation_policies,
-    many,
     split_for_episodes,
 )
 from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
@@ -46,19 +46,19 @@ class HostDriver:
         self._env = env
         self._env.episode_length = self.settings.episode_length
         specs, seeds = self.layout.specs(), self.layout.specs().seeds
-        spread, before = self.layout.spread, specs.without_rings()
-        self._init = spread(self._init_local, (BY_SEED,) * 3, specs, compiler_options=COMPILED_QUICKLY)
-        self._begin = spread(self._begin_local, (specs,), (before, specs, SHARED), donate_argnums=0)
-        self._act = spread(self._act_local, (specs.counters, seeds, BY_SEED), (BY_SEED,) * 4)
-        self._observe = spread(
+        jit, before = self.layout.jit_shard_map, specs.without_rings()
+        self._init = jit(self._init_local, (BY_SEED,) * 3, specs, compiler_options=COMPILED_QUICKLY)
+        self._begin = jit(self._begin_local, (specs,), (before, specs, SHARED), donate_argnums=0)
+        self._act = jit(self._act_local, (specs.counters, seeds, BY_SEED), (BY_SEED,) * 4)
+        self._observe = jit(
             self._observe_local,
             (specs, *(BY_SEED,) * 6, SHARED),
             (specs, BY_SEED),
             donate_argnums=0,
         )
-        self._settle = spread(partial(health.settle, self.layout), (before, specs), (specs, BY_SEED), donate_argnums=1)
+        self._settle = jit(partial(health.settle, self.layout), (before, specs), (specs, BY_SEED), donate_argnums=1)
         self._policies = evaluation_policies(algorithm)
-        self._evaluation_actions = spread(
+        self._evaluation_actions = jit(
             jax.vmap(partial(evaluation_actions, algorithm), in_axes=(0, None, 0, 0, 0)),
             (BY_SEED, SHARED, BY_SEED, BY_SEED, BY_SEED),
             (BY_SEED, BY_SEED),
@@ -80,7 +80,7 @@ class HostDriver:
         transition, flag = Transition(obs, action, number, obs, number), jax.ShapeDtypeStruct((seeds,), bool)
         episode_keys = jax.eval_shape(lambda key: split_for_episodes(key, episodes).actions, state.seeds.key)
         policies = jax.eval_shape(self._policies, state.seeds, state.seeds.key)
-        remembered = jax.eval_shape(lambda: many(self.algorithm.memory(), seeds, episodes))
+        remembered = jax.eval_shape(lambda: broadcast_leaves(self.algorithm.memory(), seeds, episodes))
         states = self._shape(episodes, spec.obs_size)
         programs = [
             (self._begin, (state,)),
@@ -134,7 +134,7 @@ class HostDriver:
         obs = env.reset()
         compiled_for = self._compiled_evaluation_actions if episodes == self.settings.eval_episodes else None
         act, count = compiled_for or self._evaluation_actions, seeds * episodes
-        memory = many(self.algorithm.memory(), seeds, episodes)
+        memory = broadcast_leaves(self.algorithm.memory(), seeds, episodes)
         total, length, alive = np.zeros(count), np.zeros(count, int), np.ones(count, bool)
         for t in itertools.count():
             if not alive.any():

@@ -15,9 +15,9 @@ from vecpsmbpo.drivers.common import (
     SHARED,
     EpisodeKeys,
     Returns,
+    broadcast_leaves,
     compiled,
     evaluation_actions,
-    many,
     split_for_episodes,
 )
 from vecpsmbpo.layout import SEEDS
@@ -37,9 +37,11 @@ class ScanDriver:
         self.layout = algorithm.layout
         self.compile_seconds = 0.0
         specs = self.layout.specs()
-        self._init = self.layout.spread(self._init_local, (BY_SEED,) * 2, specs, compiler_options=COMPILED_QUICKLY)
-        self._run = self.layout.spread(self._run_local, (specs, SHARED), (specs, _LOG), donate_argnums=0)
-        self._evaluate = self.layout.spread(self._evaluate_local, (specs.seeds, BY_SEED), (BY_SEED, BY_SEED))
+        self._init = self.layout.jit_shard_map(
+            self._init_local, (BY_SEED,) * 2, specs, compiler_options=COMPILED_QUICKLY
+        )
+        self._run = self.layout.jit_shard_map(self._run_local, (specs, SHARED), (specs, _LOG), donate_argnums=0)
+        self._evaluate = self.layout.jit_shard_map(self._evaluate_local, (specs.seeds, BY_SEED), (BY_SEED, BY_SEED))
         self._compiled: Any = None
         self._compiled_evaluate: Any = None
 
@@ -134,7 +136,7 @@ class ScanDriver:
 
             count = keys.resets.shape[0]
             start = jax.vmap(self.env.reset)(keys.resets)
-            memory = many(self.algorithm.memory(), count)
+            memory = broadcast_leaves(self.algorithm.memory(), count)
             carry = (0, memory, start, jnp.zeros(count), jnp.zeros(count, jnp.int32), jnp.ones(count, bool))
             *_, total, length, _ = jax.lax.while_loop(running, step, carry)
             return total, length

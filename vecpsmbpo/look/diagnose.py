@@ -240,19 +240,19 @@ def _evaluation_act(trained: "Trained", each: int) -> Any:
     import jax
     import jax.numpy as jnp
 
-    from vecpsmbpo.drivers.common import BY_SEED, SHARED, evaluation_actions, evaluation_policies, many
+    from vecpsmbpo.drivers.common import BY_SEED, SHARED, broadcast_leaves, evaluation_actions, evaluation_policies
     from vecpsmbpo.layout import Layout
 
     algorithm = trained.algorithm
     policies = evaluation_policies(algorithm)(trained.state, trained.state.key)
     policy = jax.tree.map(lambda x: np.asarray(x[trained.index : trained.index + 1]), policies)
     alone = replace(algorithm, layout=Layout.of(replace(trained.run.settings, num_seeds=1, sweep=())))
-    act = alone.layout.spread(
+    act = alone.layout.jit_shard_map(
         jax.vmap(partial(evaluation_actions, alone), in_axes=(0, None, 0, 0, 0)),
         (BY_SEED, SHARED, BY_SEED, BY_SEED, BY_SEED),
         (BY_SEED, BY_SEED),
     )
-    memory = many(alone.memory(), 1, each)
+    memory = broadcast_leaves(alone.memory(), 1, each)
 
     def taken(step: int, obs: Array, key: Any) -> tuple[Array, Array]:
         nonlocal memory

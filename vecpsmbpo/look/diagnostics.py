@@ -209,7 +209,7 @@ def told(episodes: Episodes, discount: float) -> Array:
 def sample(actors: Params, obs: jax.Array, key: jax.Array, *, actor: networks.Actor) -> tuple[jax.Array, jax.Array]:
     """Actions that each member draws, and their log-densities: actors [P, ...], obs [P, B, O] -> [P, B, A], [P, B]."""
     keys = jax.random.split(key, len(obs))
-    return jax.vmap(lambda params, obs, key: actor.law(params, obs).sample(key))(actors, obs, keys)
+    return jax.vmap(lambda params, obs, key: actor.distribution(params, obs).sample(key))(actors, obs, keys)
 
 
 @partial(jax.jit, static_argnames="nets")

@@ -174,7 +174,7 @@ def member_names(run: Run) -> list[str]:
 
 @partial(jax.jit, static_argnames="actor")
 def _mean_action(params: Any, obs: Any, *, actor: networks.Actor) -> jax.Array:
-    return actor.law(params, obs).mode()
+    return actor.distribution(params, obs).mode()
 
 
 @partial(jax.jit, static_argnames="algorithm")
@@ -190,7 +190,7 @@ def _evaluated(trained: Trained, who: str) -> Act:
     settings = replace(settings, eval_policy=who, eval_actions="mean")
     if isinstance(settings, PosteriorSettings) and settings.posterior == "average":
         actor, actors = trained.nets.actor, trained.actors()
-        return jax.jit(lambda obs: jax.vmap(lambda params: actor.law(params, obs).mode())(actors).mean(axis=0))
+        return jax.jit(lambda obs: jax.vmap(lambda params: actor.distribution(params, obs).mode())(actors).mean(axis=0))
     algorithm = replace(trained.algorithm, settings=settings)
     chosen = trained.of_lane(evaluation_policies(algorithm)(trained.state, trained.state.key))
     return partial(_evaluation_action, chosen, algorithm=algorithm)

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from vecpsmbpo import checkpoint, config, crash, health, jsonl, metrics, resources, runtime, versions
+from vecpsmbpo import checkpoint, config, crash, health, jsonl, metrics, placement, resources, runtime, versions
 from vecpsmbpo.drivers import Driver, Interrupted, Returns
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.look import report
@@ -203,7 +203,7 @@ class _Session:
         ]
 
     def _epoch_lines(self) -> list[metrics.Line]:
-        return metrics.epoch_lines(self.driver.layout.unpad(self.state.without_rings()), self.settings)
+        return metrics.epoch_lines(placement.unpad(self.driver.layout, self.state.without_rings()), self.settings)
 
     def _note_frozen(self) -> None:
         """Says and writes which lanes were frozen in the chunk that ended."""

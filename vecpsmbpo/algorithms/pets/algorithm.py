@@ -69,7 +69,7 @@ class Pets(Algorithm):
                 keys = jax.random.fold_in(key, ids[0])
                 return planning.expected_returns(models, obs, plans, keys, settings=settings, spec=spec)
 
-            return layout.share(part, plans)
+            return layout.map_sharded(part, plans)
 
         def anew(plan):
             shifted = jnp.concatenate([plan[1:], jnp.zeros_like(plan[:1])])

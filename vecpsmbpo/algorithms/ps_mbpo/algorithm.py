@@ -83,7 +83,7 @@ class PsMbpo(Algorithm):
         else:
             logits = posterior.logits(state.posterior, self.values(state), state.hyper.temperature)
             member, _ = posterior.draw(logits, key)
-        return self.layout.ask(member, state.agents.actor)
+        return self.layout.select_member(member, state.agents.actor)
 
     def evaluation_action(
         self, policy: Params, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
@@ -92,11 +92,11 @@ class PsMbpo(Algorithm):
         step, as `choose` does; with `eval_policy=average` the average of all members' mean actions."""
         sampled = self.settings.eval_actions == "sampled"
         if not self._evaluates_all:
-            law = self.nets.actor.law(policy, obs)
-            return (law.sample(key)[0] if sampled else law.mode()), ()
+            distribution = self.nets.actor.distribution(policy, obs)
+            return (distribution.sample(key)[0] if sampled else distribution.mode()), ()
         if sampled or self.settings.eval_policy == "posterior":
             return self._of_mixture(policy, obs, key, sampled=sampled), ()
-        modes = jax.vmap(lambda params: self.nets.actor.law(params, obs).mode())(policy)
+        modes = jax.vmap(lambda params: self.nets.actor.distribution(params, obs).mode())(policy)
         return self.layout.mean_over_members(modes), ()
 
     def values(self, state: SeedState) -> jax.Array | None:
@@ -114,7 +114,7 @@ class PsMbpo(Algorithm):
         known = jnp.arange(posterior.STARTS) < state.episode.index
 
         def value(agent: Agent) -> jax.Array:
-            action = nets.actor.law(agent.actor, starts).mode()
+            action = nets.actor.distribution(agent.actor, starts).mode()
             q = jnp.minimum(*nets.critic.values(agent.critic, starts, action))
             return jnp.sum(jnp.where(known, q, 0.0)) / jnp.sum(known)
 
@@ -128,10 +128,10 @@ class PsMbpo(Algorithm):
         """[A] an action of one member: a sample, or its mean."""
 
         def action(params: Params) -> jax.Array:
-            law = self.nets.actor.law(params, obs)
-            return law.sample(key)[0] if sampled else law.mode()
+            distribution = self.nets.actor.distribution(params, obs)
+            return distribution.sample(key)[0] if sampled else distribution.mode()
 
-        return self.layout.ask(member, actors, action)
+        return self.layout.select_member(member, actors, action)
 
     def _of_mixture(self, actors: Params, obs: jax.Array, key: jax.Array, *, sampled: bool = True) -> jax.Array:
         """[A] an action of the average of all members' action distributions (figure 6), their mixture with equal

@@ -29,18 +29,18 @@ class Slbo(Algorithm):
     def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
         """A sample of the policy, clipped."""
         obs = _whitened(self._scaling(state), obs)
-        sample = lambda params: self.nets.policy.law(params, obs).sample(key)  # noqa: E731
-        return jnp.clip(self.layout.ask(state.episode.member, state.agents.policy, sample), -1.0, 1.0), ()
+        sample = lambda params: self.nets.policy.distribution(params, obs).sample(key)  # noqa: E731
+        return jnp.clip(self.layout.select_member(state.episode.member, state.agents.policy, sample), -1.0, 1.0), ()
 
     def evaluation_policy(self, state: SeedState, key: jax.Array) -> tuple[Params, Scaling]:
-        return self.layout.ask(jnp.int32(0), state.agents.policy), self._scaling(state)
+        return self.layout.select_member(jnp.int32(0), state.agents.policy), self._scaling(state)
 
     def evaluation_action(
         self, policy: tuple[Params, Scaling], step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, Any]:
         params, scaling = policy
-        law = self.nets.policy.law(params, _whitened(scaling, obs))
-        action = law.loc if self.settings.eval_actions == "mean" else law.sample(key)
+        distribution = self.nets.policy.distribution(params, _whitened(scaling, obs))
+        action = distribution.loc if self.settings.eval_actions == "mean" else distribution.sample(key)
         return jnp.clip(action, -1.0, 1.0), ()
 
     def _scaling(self, state: SeedState) -> Scaling:
@@ -102,7 +102,7 @@ class Slbo(Algorithm):
         def step(obs, xs):
             t, key = xs
             action_key, model_key, fresh_key = jax.random.split(key, 3)
-            action = self.nets.policy.law(policy, seen(obs)).sample(action_key)
+            action = self.nets.policy.distribution(policy, seen(obs)).sample(action_key)
             answer = dynamics.predict_mean(model, obs, jnp.clip(action, -1.0, 1.0), model_key, net=net, spec=spec)
             ended = answer.terminated | (t == length - 1)
             terminated = answer.terminated.astype(jnp.float32)

@@ -56,15 +56,15 @@ class GaussianPolicy(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> Normal:
-        """The law of actions."""
+        """The distribution of actions."""
         loc = TanhMLP(self.action_size, self.hidden_size, self.hidden_layers)(obs)
         log_std = self.param("log_std", nn.initializers.constant(-0.5), (self.action_size,))
         return Normal(loc, jnp.broadcast_to(log_std, loc.shape))
 
-    def law(self, params: Params, obs: Float[Array, "*batch O"]) -> Normal:
+    def distribution(self, params: Params, obs: Float[Array, "*batch O"]) -> Normal:
         """π(· | obs) of these parameters."""
-        law: Any = self.apply(params, obs)
-        return law
+        distribution: Any = self.apply(params, obs)
+        return distribution
 
 
 class StateValue(nn.Module):

@@ -97,14 +97,14 @@ def surrogate(
 ) -> Float[Array, ""]:
     """E[π / π_old · advantage] and the entropy bonus. rows: (obs [K, O], action [K, A], advantage [K])."""
     obs, action, advantage = rows
-    law = nets.policy.law(policy, obs)
-    ratio = jnp.exp(law.log_prob(action) - old_log_prob)
-    return jnp.mean(ratio * advantage) + entropy_weight * jnp.mean(law.entropy())
+    distribution = nets.policy.distribution(policy, obs)
+    ratio = jnp.exp(distribution.log_prob(action) - old_log_prob)
+    return jnp.mean(ratio * advantage) + entropy_weight * jnp.mean(distribution.entropy())
 
 
 def divergence(policy: Params, old: Params, obs: Float[Array, "K O"], *, nets: Networks) -> Float[Array, ""]:
     """Mean KL(π_old || π) over `obs`."""
-    return jnp.mean(nets.policy.law(old, obs).divergence_to(nets.policy.law(policy, obs)))
+    return jnp.mean(nets.policy.distribution(old, obs).divergence_to(nets.policy.distribution(policy, obs)))
 
 
 def natural_direction(
@@ -130,7 +130,7 @@ def policy_step(
         rows: obs [K, O], action [K, A], advantage [K].
     """
     flat, unravel = ravel_pytree(policy)
-    old_log_prob = nets.policy.law(policy, rows[0]).log_prob(rows[1])
+    old_log_prob = nets.policy.distribution(policy, rows[0]).log_prob(rows[1])
 
     def objective(x):
         return surrogate(unravel(x), old_log_prob, rows, entropy_weight, nets=nets)
@@ -186,6 +186,6 @@ def update(
         critic_loss=jnp.mean(losses),
         actor_loss=-gain,
         q_mean=jnp.mean(value),
-        entropy=jnp.mean(nets.policy.law(policy, obs).entropy()),
+        entropy=jnp.mean(nets.policy.distribution(policy, obs).entropy()),
     )
     return TrpoAgent(policy, fitted, optimizer, jax.tree.map(jnp.add, agent.stats, news))
