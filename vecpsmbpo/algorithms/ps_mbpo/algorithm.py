@@ -81,8 +81,7 @@ class PsMbpo(Algorithm):
         if self.settings.eval_policy == "best":
             member = posterior.best(state.posterior)
         else:
-            logits = posterior.logits(state.posterior, self.values(state), state.hyper.temperature)
-            member, _ = posterior.draw(logits, key)
+            member, _ = self.draw(state.posterior, self.values(state), state.hyper, key)
         return self.layout.select_member(member, state.agents.actor)
 
     def evaluation_action(
