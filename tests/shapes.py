@@ -16,17 +16,21 @@ ALGORITHMS = ("pets.planning", "slbo.trpo", "slbo.multistep", "slbo.networks")
 
 
 def check_core() -> None:
-    """Before anything imports a single function of it."""
+    """Its public functions and methods, before anything imports one of them by name."""
     for name in (*CORE, *(f"algorithms.{name}" for name in ALGORITHMS)):
         module = importlib.import_module(f"vecpsmbpo.{name}")
         _check_functions(module, module.__name__)
         for cls in [value for value in vars(module).values() if inspect.isclass(value)]:
             if cls.__module__ == module.__name__:
                 _check_functions(cls, module.__name__)
+        for table in [value for value in vars(module).values() if isinstance(value, dict)]:
+            table.update({key: getattr(module, getattr(f, "__name__", ""), f) for key, f in table.items()})
 
 
 def _check_functions(owner: Any, module: str) -> None:
     for name, value in list(vars(owner).items()):
-        own = inspect.isfunction(value) and value.__module__ == module
+        function = value.__func__ if isinstance(value, classmethod) else value
+        own = inspect.isfunction(function) and function.__module__ == module
         if own and (not name.startswith("_") or name == "__call__"):
-            setattr(owner, name, jaxtyped(typechecker=beartype)(value))
+            checked = jaxtyped(typechecker=beartype)(function)
+            setattr(owner, name, classmethod(checked) if isinstance(value, classmethod) else checked)

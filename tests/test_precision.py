@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 
 from vecpsmbpo import dynamics, networks, sac
 from vecpsmbpo.envs import specs
@@ -21,7 +22,7 @@ def products(jaxpr):
         if equation.primitive.name == "dot_general":
             types = {str(variable.aval.dtype) for variable in equation.invars}
             yield frozenset(types), equation.params["precision"]
-        for inner in jax.core.jaxprs_in_params(equation.params):
+        for inner in jaxprs_in_params(equation.params):
             yield from products(inner)
 
 
@@ -37,15 +38,15 @@ def update_of(precision):
     return lambda agent: sac.update(agent, rows, noise, hyper, nets=nets), sac.init(jax.random.key(0), nets, SPEC)
 
 
-def test_bfloat16_multiplies_all_hidden_layers_in_it_forwards_and_backwards():
+def test_bfloat16_multiplies_the_inner_layers_in_it_forwards_and_backwards():
     update, agent = update_of("bfloat16")
     found = [types for types, _ in products(jax.make_jaxpr(update)(agent).jaxpr)]
-    # By hand: 45 products with two hidden layers. The last layers are float32: forwards in two actors and in target,
-    # trained and asking critics (twice each), 8; backwards to weights and inputs in the critics' loss, 4; in the
-    # actor's loss to the critics' inputs, 2, and to the actor's weights and inputs, 2.
+    # By hand: 45 products with two hidden layers. The second of these is the inner one: forwards in two actors and
+    # in target, trained and asking critics (twice each), 8; backwards to weights and inputs in the critics' loss, 4;
+    # in the actor's loss to the critics' inputs, 2, and to the actor's weights and inputs, 2.
     assert len(found) == 45
-    assert found.count(frozenset({"bfloat16"})) == 45 - 16
-    assert found.count(frozenset({"float32"})) == 16
+    assert found.count(frozenset({"bfloat16"})) == 16
+    assert found.count(frozenset({"float32"})) == 45 - 16
 
 
 def test_float32_is_asked_for_in_every_product():
@@ -58,6 +59,18 @@ def test_what_is_kept_is_float32():
     update, agent = update_of("bfloat16")
     kept = [leaf.dtype for leaf in jax.tree.leaves(jax.eval_shape(update, agent))]
     assert set(map(str, kept)) <= {"float32", "int32"}
+
+
+def test_losses_and_log_densities_are_float32(key):
+    nets = sac.make_networks(tiny(network_precision="bfloat16"), SPEC)
+    agent = sac.init(key, nets, SPEC)
+    obs, noise = jnp.ones((BATCH, OBS)), jnp.ones((BATCH, ACTION))
+    asked = {
+        "log-density": nets.actor.distribution(agent.actor, obs).reparameterized(noise),
+        "values": nets.critic.values(agent.critic, obs, noise),
+        "loss": sac.actor_loss(agent.actor, agent.critic, 0.1, obs, noise, nets=nets),
+    }
+    assert {leaf.dtype for leaf in jax.tree.leaves(asked)} == {jnp.dtype(jnp.float32)}
 
 
 @pytest.mark.parametrize("norm", list(networks.NORMS))

@@ -29,6 +29,7 @@ from vecpsmbpo import config, envs, replay, runtime, sac
 from vecpsmbpo.algorithms.ps_mbpo.algorithm import PsMbpo
 from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.envs import registry, specs
+from vecpsmbpo.layout import SEEDS
 from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.training.programs import initial_inputs, make_driver
@@ -42,6 +43,7 @@ PAPER = [
     "horizon_last=1",
     "warmup_steps=250",
 ]
+WORLD_STRIDES = 4
 PROFILE_SECONDS = 150  # after which a large program's strides have been timed often enough
 SMALL = ["env=cartpole_swingup", "size=cpu", "warmup_steps=250", "rollout_starts=2500"]
 
@@ -87,7 +89,8 @@ def driver_of(overrides: list[str]) -> ScanDriver:
     settings = config.compose([*overrides, *sys.argv[2:]])
     runtime.configure(settings)
     driver = make_driver(settings)
-    assert isinstance(driver, ScanDriver)
+    if not isinstance(driver, ScanDriver):
+        sys.exit(f"env={settings.env} backend={settings.backend}: only programs with MJX inside are measured")
     return driver
 
 
@@ -149,35 +152,53 @@ def bench_updates() -> dict[str, Any]:
 
 
 def bench_pieces() -> dict[str, Any]:
-    return pieces_of_update(config.compose([*PAPER, *sys.argv[2:]]))
+    settings = config.compose([*PAPER, *sys.argv[2:]])
+    runtime.configure(settings)
+    return {"task": settings.env, "width": settings.policy_hidden_size, **pieces_of_update(settings)}
 
 
 def pieces_of_update(settings: Settings) -> dict[str, int]:
     """How many instructions of each kind the compiled loop over G updates of one member has in its body."""
     spec = specs.get(settings.env)
-    nets, hyper, key = sac.make_networks(settings, spec), Hyper.of(settings), jax.random.key(0)
-    shape = (settings.updates_per_step, settings.policy_batch_size)
-    ring = replay.init(2, spec.obs_size, spec.action_size)
-    batches = replay.unpack(ring[jnp.zeros(shape, int)], spec.obs_size, spec.action_size)
-    noise = sac.Noise.draw(key, (*shape, spec.action_size))
-    run = jax.jit(lambda agent: sac.updates(agent, batches, noise, hyper, nets=nets))
-    return loop_pieces(run.lower(sac.init(key, nets, spec)).compile().as_text())
+    nets, key = sac.make_networks(settings, spec), jax.random.key(0)
+
+    def inputs() -> tuple:
+        shape = (settings.updates_per_step, settings.policy_batch_size)
+        rows = jnp.zeros((*shape, replay.row_size(spec.obs_size, spec.action_size)))
+        batches = replay.unpack(rows, spec.obs_size, spec.action_size)
+        noise = sac.Noise.draw(key, (*shape, spec.action_size))
+        return sac.init(key, nets, spec), batches, noise, Hyper.of(settings), sac.Limits(jnp.zeros(()), jnp.zeros(()))
+
+    def run(agent: Any, batches: Any, noise: Any, hyper: Hyper, limits: sac.Limits) -> Any:
+        known = limits if settings.clip_targets else None
+        every = settings.target_update_every
+        return sac.updates(agent, batches, noise, hyper, nets=nets, limits=known, target_every=every)
+
+    return loop_pieces(jax.jit(run).lower(*jax.eval_shape(inputs)).compile().as_text())
 
 
 def loop_pieces(program: str) -> dict[str, int]:
-    """Of an XLA program in its text form: what is in the bodies of its loops, and in all that these call."""
+    """Of an XLA program in its text form: what is in the bodies of its loops, and in all that these call.
+
+    Raises:
+        ValueError: there is no loop.
+    """
     computations = dict(re.findall(r"^(?:ENTRY )?%?([\w.\-]+) \([^\n]*\{\n(.*?)^\}", program, re.M | re.S))
     seen: set[str] = set()
     waiting = re.findall(r" while\(.*body=%?([\w.\-]+)", program)
+    if not waiting:
+        raise ValueError("the program has no loop: XLA unrolls one of a single update")
     while waiting:
         name = waiting.pop()
         if name not in seen:
             seen.add(name)
-            called = r"(?:calls|to_apply|body|condition)=%?([\w.\-]+)"
-            waiting += re.findall(called, computations[name])
+            called = r"(?:calls|to_apply|body|condition|\w+_computations?)=\{?([^,}\s]+(?:, %[^,}\s]+)*)"
+            waiting += [
+                part.lstrip("%") for parts in re.findall(called, computations[name]) for part in parts.split(", ")
+            ]
     body = "".join(computations[name] for name in seen)
-    kinds = {"products": r"(?:dot|custom-call)", "fusions": "fusion", "copies": "copy"}
-    return {kind: len(re.findall(rf" {name}\(", body)) for kind, name in kinds.items()}
+    products = len(re.findall(r" dot\(|custom_call_target=\"[^\"]*(?:gemm|matmul)", body))
+    return {"products": products, "fusions": body.count(" fusion("), "copies": body.count(" copy(")}
 
 
 def bench_capacity() -> dict[str, Any]:
@@ -205,42 +226,43 @@ def bench_program() -> dict[str, Any]:
 
 def bench_profile() -> dict[str, Any]:
     """Strides of the real program are timed one by one: before the warm-up is over they are the world alone, then
-    updates come on top, and at the start of every period a refresh. What cannot be told apart so is timed by itself."""
+    updates come on top, and at the start of every period a refresh. What cannot be told apart so is timed by itself.
+    A stride by itself pays for being started and for its news, which a run pays once for an epoch: it counts as acting.
+    """
     driver = driver_of([] if sys.argv[2:] else ["env=cartpole_swingup", "size=cpu"])
-    settings = driver.settings
-    if settings.model_update_every == settings.stride:
-        sys.exit(f"profile: model_update_every={settings.model_update_every} is one stride; periods need more than one")
+    settings, algorithm, layout = driver.settings, driver.algorithm, driver.layout
+    strides, warm = settings.epoch_steps // settings.stride, settings.first_learning_step // settings.stride
+    if not isinstance(algorithm, PsMbpo) or settings.model_update_every == settings.stride or warm < WORLD_STRIDES + 1:
+        sys.exit("profile: needs SAC, periods of more than a stride, and a warm-up of more than 100 steps")
     keys, given = initial_inputs(settings)
     state = driver.init(keys, given)
     driver.compile(state)
-    warm, per_epoch = settings.first_learning_step // settings.stride, settings.epoch_steps // settings.stride
-    state = run_strides(driver, state, warm - 4)
+    state = run_strides(driver, state, warm - WORLD_STRIDES)
     world, learning, refreshing = [], [], []
-    for _ in range(4):
+    for _ in range(WORLD_STRIDES):
         state, seconds = timed_stride(driver, state)
         world.append(seconds)
     began = time.perf_counter()
-    for index in range(per_epoch):
+    for index in range(strides):
         state, seconds = timed_stride(driver, state)
-        (learning if index % (per_epoch // settings.refreshes_per_epoch) else refreshing).append(seconds)
-        if index and time.perf_counter() - began > PROFILE_SECONDS:
+        (learning if index % (strides // settings.refreshes_per_epoch) else refreshing).append(seconds)
+        if learning and time.perf_counter() - began > PROFILE_SECONDS:
             break
-    imagining = seconds_per_refresh(driver, state)
-    began = time.perf_counter()
-    driver.evaluate(state, keys, settings.eval_episodes)
-    evaluating = time.perf_counter() - began
-    lanes = len(settings.lanes)
-    stepping = lanes * settings.epoch_steps / mjx_steps(settings.env, lanes)["steps_per_s"]
-    acting = per_epoch * np.median(world)
-    updating = per_epoch * (np.median(learning) - np.median(world))
-    refresh = settings.refreshes_per_epoch * (np.mean(refreshing) - np.median(learning))
-    imagining *= settings.refreshes_per_epoch
+    evaluate = lambda: driver.evaluate(state, keys, settings.eval_episodes)  # noqa: E731
+    evaluate()
+    evaluating = best_seconds(evaluate, 2)
+    lanes = len(settings.lanes) // layout.mesh.shape[SEEDS]  # of a device
+    stepping = (
+        lanes * settings.epoch_steps / mjx_steps(settings.env, lanes, **dict(settings.env_options))["steps_per_s"]
+    )
+    imagining = seconds_per_imagining(driver, state) * settings.refreshes_per_epoch if settings.imagines else 0.0
+    refresh = settings.refreshes_per_epoch * max(np.mean(refreshing) - np.median(learning), 0.0)
     seconds_of = {
-        "updating": updating,
-        "fitting": refresh - imagining,
+        "updating": strides * (np.median(learning) - np.median(world)),
+        "fitting": max(refresh - imagining, 0.0),
         "imagining": imagining,
         "stepping": stepping,
-        "acting_and_observing": acting - stepping,
+        "acting_and_observing": strides * np.median(world) - stepping,
         "evaluating": evaluating,
     }
     whole = sum(seconds_of.values())
@@ -249,6 +271,8 @@ def bench_profile() -> dict[str, Any]:
         "members": settings.n_members,
         "width": settings.policy_hidden_size,
         "from_step": settings.first_learning_step,
+        "strides_timed": len(learning),
+        "refreshes_timed": len(refreshing),
         "seconds_of_an_epoch": whole,
         **{name: seconds / whole for name, seconds in seconds_of.items()},
     }
@@ -270,20 +294,23 @@ def timed_stride(driver: ScanDriver, state: TrainState) -> tuple[TrainState, flo
     return state, time.perf_counter() - began
 
 
-def seconds_per_refresh(driver: ScanDriver, state: TrainState) -> float:
-    """Of imagining alone, for every member; 0 where the algorithm does not."""
-    algorithm = driver.algorithm
-    if not isinstance(algorithm, PsMbpo):
-        return 0.0
+def seconds_per_imagining(driver: ScanDriver, state: TrainState) -> float:
+    """Of one refresh, for every member, by itself; the state is consumed, so that rings are written in place."""
     specs = driver.layout.specs()
 
-    def body(state: TrainState) -> Any:
-        imagine = lambda counters, seed, key: algorithm.imagine(counters, seed, jnp.bool_(True), key)[1]  # noqa: E731
-        return over_seeds(imagine)(state.counters, state.seeds, state.seeds.key).imagined
+    def body(state: TrainState) -> TrainState:
+        def imagine(counters: Any, seed: Any, key: Any) -> Any:
+            return driver.algorithm.imagine(counters, seed, jnp.bool_(True), key)[1]
 
-    run = driver.layout.jit_shard_map(body, (specs,), specs.seeds.imagined)
-    jax.block_until_ready(run(state))
-    return best_seconds(lambda: run(state), 2)
+        return state.replace(seeds=over_seeds(imagine)(state.counters, state.seeds, state.seeds.key))
+
+    run = driver.layout.jit_shard_map(body, (specs,), specs, donate_argnums=0)
+    seconds = []
+    for _ in range(3):  # the first compiles
+        began = time.perf_counter()
+        state = jax.block_until_ready(run(state))
+        seconds.append(time.perf_counter() - began)
+    return min(seconds)
 
 
 def bench_envs() -> list[dict[str, Any]]:
@@ -300,8 +327,8 @@ def bench_envs() -> list[dict[str, Any]]:
     return found
 
 
-def mjx_steps(name: str, batch: int) -> dict[str, float]:
-    env, steps = envs.make(name, "mjx"), 50
+def mjx_steps(name: str, batch: int, **options: Any) -> dict[str, float]:
+    env, steps = envs.make(name, "mjx", **options), 50
 
     def step(state, key):
         action = jax.random.uniform(key, (batch, env.action_size), minval=-1.0, maxval=1.0)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from vecpsmbpo import networks, optim, replay
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import Count, EnvSpec, Hyper, Model, Moments, Params, Prior, Scaling, Transition
+from vecpsmbpo.types import EnvSpec, Hyper, Model, Moments, Params, Prior, Scaling, Transition, Whole
 
 VALIDATION_BATCH = 512
 
@@ -32,7 +32,7 @@ class Split(NamedTuple):
     blocks: jax.Array
 
     @classmethod
-    def draw(cls, key: PRNGKeyArray, rows: Count, capacity: int, block: int) -> "Split":
+    def draw(cls, key: PRNGKeyArray, rows: Whole, capacity: int, block: int) -> "Split":
         offset = jax.random.randint(key, (-(-capacity // block),), 0, block)
         return cls(offset, jnp.minimum(rows, capacity) // block)
 
@@ -44,7 +44,7 @@ class Split(NamedTuple):
         return chosen * block + (self.offset[chosen] + shift) % block
 
     def validation_rows(
-        self, start: Count, batch: int, block: int
+        self, start: Whole, batch: int, block: int
     ) -> tuple[Int[Array, " {batch}"], Bool[Array, " {batch}"]]:
         """Validation rows `start` to `start + batch`: their indices, and which of them exist."""
         chosen = start + jnp.arange(batch)
@@ -74,7 +74,7 @@ def init(key: PRNGKeyArray, hyper: Hyper, settings: Settings, spec: EnvSpec) -> 
     return Model(params, optim.init(params), plain, loss=zero, val_mse=zero, prior=prior)
 
 
-def scaling(moments: Moments, rows: Count, settings: Settings) -> Scaling:
+def scaling(moments: Moments, rows: Whole, settings: Settings) -> Scaling:
     """What whitens the inputs (equation 20) and, with `whiten_targets`, the outputs: changes Δs and rewards.
 
     What has never varied is left unscaled: there is nothing to learn of it yet, and dividing by a vanishing deviation

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from vecpsmbpo import dynamics, replay, sac
 from vecpsmbpo.settings.parts import ImaginationSettings
-from vecpsmbpo.types import Count, EnvSpec, Model, Params, Transition
+from vecpsmbpo.types import EnvSpec, Model, Params, Transition, Whole
 
 LARGEST_CHUNK = 4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
 
@@ -67,7 +67,7 @@ def rows_per_refresh(settings: ImaginationSettings, env_steps: Int[Array, "*step
     return chunks_per_refresh(settings, now) * now * chunk_size(settings)
 
 
-def retained_rows(settings: ImaginationSettings, env_steps: Count) -> Int[Array, ""]:
+def retained_rows(settings: ImaginationSettings, env_steps: Whole) -> Int[Array, ""]:
     """How many of the newest rows policies learn from after `env_steps` steps: those of one epoch of refreshes.
 
     As both MBPO codebases have it: older rows come from models fitted on less data and from policies of long ago. Each
@@ -135,7 +135,7 @@ def predict_with_any(
 
 
 def start_states(
-    real: Float[Array, "C F"], rows: Count, key: PRNGKeyArray, count: int, spec: EnvSpec
+    real: Float[Array, "C F"], rows: Whole, key: PRNGKeyArray, count: int, spec: EnvSpec
 ) -> Float[Array, "{count} O"]:
     """Observations drawn uniformly from D_E."""
     return real[replay.sample_indices(key, (count,), rows, real.shape[0]), : spec.obs_size]

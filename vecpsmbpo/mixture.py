@@ -5,11 +5,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vecpsmbpo.settings.parts import PosteriorSettings
-from vecpsmbpo.types import Bandit, Count, Hyper, Number
+from vecpsmbpo.types import Bandit, Hyper, Number, Whole
 
 
 def real_ratios(
-    settings: PosteriorSettings, hyper: Hyper, bandit: Bandit | None, env_steps: Count
+    settings: PosteriorSettings, hyper: Hyper, bandit: Bandit | None, env_steps: Whole
 ) -> Float[Array, " members"]:
     """The λ with which each member learns now."""
     if bandit is not None:
@@ -76,7 +76,7 @@ def init(settings: PosteriorSettings) -> Bandit:
     return Bandit(excess=nothing, counts=nothing, rounds=jnp.int32(0), lowest=most, highest=-most)
 
 
-def discount(rounds: Count) -> Float[Array, ""]:
+def discount(rounds: Whole) -> Float[Array, ""]:
     """What of earlier rounds is left after one more: 1 - 1 / (8 √rounds).
 
     The order is that of the optimum for few changes (Garivier and Moulines, 2011, who take 1 / 4); rounds so far stand
@@ -86,7 +86,7 @@ def discount(rounds: Count) -> Float[Array, ""]:
     return 1 - 1 / (8 * jnp.sqrt(rounds))
 
 
-def credit(bandit: Bandit, arm: Count, episode_return: Number) -> Bandit:
+def credit(bandit: Bandit, arm: Whole, episode_return: Number) -> Bandit:
     """Adds an episode's return to its arm.
 
     The range shrinks around its middle as old rounds are forgotten, and always holds the newest return: an outlier or

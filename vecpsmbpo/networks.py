@@ -17,12 +17,11 @@ LOG_PROB_BOUND = 3.8  # arctanh(0.999), where Acme's log-densities of a tanh sto
 
 
 class Precision(NamedTuple):
-    """Of the hidden layers. Parameters are float32 always, and so is the last layer: a critic whose values of 100 are
-    half a unit apart, as bfloat16 has them, cannot tell actions apart.
+    """Of a network's products. Parameters are float32 always.
 
     Attributes:
-        dtype: of activations and of what is multiplied.
-        products: of their products, as XLA knows it; None is what the device does.
+        dtype: of hidden activations, and of what the layers between the first and the last multiply.
+        products: of the other products, as XLA knows it; None is what the device does.
     """
 
     dtype: Any
@@ -32,19 +31,26 @@ class Precision(NamedTuple):
 PRECISIONS = {
     "default": Precision(jnp.float32, None),
     "float32": Precision(jnp.float32, jax.lax.Precision.HIGHEST),
-    "bfloat16": Precision(jnp.bfloat16, None),
+    "bfloat16": Precision(jnp.bfloat16, jax.lax.Precision.HIGHEST),
 }
 
 
-def hidden_layer(size: int, kernel_init: Any, precision: str) -> nn.Dense:
-    """A dense layer of `size` outputs, of a `PRECISIONS` name."""
+def outer_layer(size: int, kernel_init: Any, precision: str) -> nn.Dense:
+    """A first or last layer, of a `PRECISIONS` name: float32 whatever that is, since bfloat16 cannot tell positions of
+    0.85 that are 4 mm apart, nor values of 100 that are half a unit apart."""
+    return nn.Dense(size, dtype=jnp.float32, precision=PRECISIONS[precision].products, kernel_init=kernel_init)
+
+
+def inner_layer(size: int, kernel_init: Any, precision: str) -> nn.Dense:
+    """A layer between the first and the last."""
     dtype, products = PRECISIONS[precision]
     return nn.Dense(size, dtype=dtype, precision=products, kernel_init=kernel_init)
 
 
-def last_layer(size: int, kernel_init: Any, precision: str) -> nn.Dense:
-    """As `hidden_layer`, of float32 whatever the precision."""
-    return nn.Dense(size, dtype=jnp.float32, precision=PRECISIONS[precision].products, kernel_init=kernel_init)
+def hidden_layer(index: int, hidden: jax.Array, size: int, kernel_init: Any, precision: str) -> jax.Array:
+    """What goes into the activation function of hidden layer `index`, from 0."""
+    layer = inner_layer if index else outer_layer
+    return layer(size, kernel_init, precision)(hidden).astype(PRECISIONS[precision].dtype)
 
 
 model_init = nn.initializers.variance_scaling(1.0, "fan_in", "truncated_normal")
@@ -80,11 +86,11 @@ class GaussianMLP(nn.Module):
 
     @nn.compact
     def outputs(self, inputs: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
-        """f_θ: inputs (s, a), whitened, to what the prediction is made of."""
+        """f_θ: inputs [..., O + A], whitened, to what the prediction is made of."""
         hidden = inputs
-        for _ in range(self.hidden_layers):
-            hidden = nn.swish(hidden_layer(self.hidden_size, model_init, self.precision)(hidden))
-        return last_layer(2 * self.output_size + self.predicts_termination, model_init, self.precision)(hidden)
+        for index in range(self.hidden_layers):
+            hidden = nn.swish(hidden_layer(index, hidden, self.hidden_size, model_init, self.precision))
+        return outer_layer(2 * self.output_size + self.predicts_termination, model_init, self.precision)(hidden)
 
     def __call__(
         self,
@@ -92,9 +98,9 @@ class GaussianMLP(nn.Module):
         scale: Float[Array, " predicted"] | float = 1.0,
         prior: Any = 0.0,
     ) -> Prediction:
-        """The prediction of f_θ + prior, whose outputs are in units of `scale`.
+        """The prediction of f_θ + prior, whose outputs are in units of `scale` [O + 1].
 
-        Inputs (s, a) are whitened. In small units the variance may rise as far as in the plain ones.
+        inputs [..., O + A], whitened. In small units the variance may rise as far as in the plain ones.
         """
         outputs = self.outputs(inputs) + prior
         mean, log_variance, rest = jnp.split(outputs, [self.output_size, 2 * self.output_size], axis=-1)
@@ -117,8 +123,8 @@ def layer_norm(x: Float[Array, "*batch H"]) -> Float[Array, "*batch H"]:
 
 def rms_norm(x: Float[Array, "*batch H"]) -> Float[Array, "*batch H"]:
     """Each row at mean square 1 (Zhang and Sennrich, 2019)."""
-    squares = jnp.square(x.astype(jnp.float32))
-    return x * jax.lax.rsqrt(jnp.mean(squares, axis=-1, keepdims=True) + 1e-6).astype(x.dtype)
+    exact = x.astype(jnp.float32)
+    return x * jax.lax.rsqrt(jnp.mean(exact * exact, axis=-1, keepdims=True) + 1e-6).astype(x.dtype)
 
 
 NORMS: dict[str, Callable[[jax.Array], jax.Array]] = {"none": lambda x: x, "layer": layer_norm, "rms": rms_norm}
@@ -140,10 +146,10 @@ class ReluMLP(nn.Module):
 
     @nn.compact
     def __call__(self, hidden: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
-        for _ in range(self.hidden_layers):
-            layer = hidden_layer(self.hidden_size, policy_init, self.precision)
-            hidden = nn.relu(NORMS[self.norm](layer(hidden)))
-        return last_layer(self.output_size, policy_init, self.precision)(hidden)
+        for index in range(self.hidden_layers):
+            hidden = hidden_layer(index, hidden, self.hidden_size, policy_init, self.precision)
+            hidden = nn.relu(NORMS[self.norm](hidden))
+        return outer_layer(self.output_size, policy_init, self.precision)(hidden)
 
 
 class TanhGaussian(NamedTuple):

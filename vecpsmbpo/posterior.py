@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from vecpsmbpo.types import Count, Episode, Flag, Number, Posterior
+from vecpsmbpo.types import Episode, Flag, Number, Posterior, Whole
 
 STARTS = 32  # K, episodes whose first observations members are asked about
 
@@ -13,7 +13,7 @@ def init(members: int) -> Posterior:
     return Posterior(jnp.zeros(members), jnp.zeros(members), jnp.zeros(members, jnp.int32))
 
 
-def credit(posterior: Posterior, member: Count, episode_return: Number, counts: Flag) -> Posterior:
+def credit(posterior: Posterior, member: Whole, episode_return: Number, counts: Flag) -> Posterior:
     """Adds an episode's return to its member where `counts` (equation 19 sums over all past episodes).
 
     Compensated (Kahan) addition: after hundreds of episodes of thousands, plain float32 sums would be off by more
@@ -68,6 +68,6 @@ def draw(logits: Float[Array, " members"], key: PRNGKeyArray) -> tuple[Int[Array
     return jax.random.categorical(key, logits), jax.nn.softmax(logits)
 
 
-def exploration_probability(forced_exploration: Number, episode: Count) -> Float[Array, ""]:
+def exploration_probability(forced_exploration: Number, episode: Whole) -> Float[Array, ""]:
     """min(1, τ / k): with it the k-th episode after the warm-up, from 1, takes random actions (equation 33)."""
     return jnp.minimum(1.0, forced_exploration / episode)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from vecpsmbpo.types import Count, Transition
+from vecpsmbpo.types import Transition, Whole
 
 
 def row_size(obs_size: int, action_size: int) -> int:
@@ -36,7 +36,7 @@ def unpack(rows: Float[Array, "*batch F"], obs_size: int, action_size: int) -> T
     return Transition(obs, action, scalars[..., 0], next_obs, scalars[..., 1])
 
 
-def add(ring: Float[Array, "*rings C F"], rows: Float[Array, "*rings B F"], added: Count) -> Float[Array, "*rings C F"]:
+def add(ring: Float[Array, "*rings C F"], rows: Float[Array, "*rings B F"], added: Whole) -> Float[Array, "*rings C F"]:
     """Writes rows into every ring after the `added` rows that it has received so far.
 
     B must divide C, and every earlier block must have been of B rows too: a block never wraps.
@@ -46,19 +46,19 @@ def add(ring: Float[Array, "*rings C F"], rows: Float[Array, "*rings B F"], adde
     return jax.lax.dynamic_update_slice(ring, rows, start)
 
 
-def sample_indices(key: PRNGKeyArray, shape: tuple[int, ...], added: Count, capacity: int) -> Int[Array, "..."]:
-    """Uniform indices of stored rows, with replacement. An empty ring gives zeros."""
+def sample_indices(key: PRNGKeyArray, shape: tuple[int, ...], added: Whole, capacity: int) -> Int[Array, "..."]:
+    """Uniform indices of stored rows, of this shape, with replacement. An empty ring gives zeros."""
     return jax.random.randint(key, shape, 0, jnp.clip(added, 1, capacity))
 
 
 def sample_newest_indices(
-    key: PRNGKeyArray, shape: tuple[int, ...], added: Count, capacity: int, newest: Count
+    key: PRNGKeyArray, shape: tuple[int, ...], added: Whole, capacity: int, newest: Whole
 ) -> Int[Array, "..."]:
     """As `sample_indices`, of the `newest` rows only."""
     age = jax.random.randint(key, shape, 0, jnp.clip(jnp.minimum(added, newest), 1, capacity))
     return (added - 1 - age) % capacity
 
 
-def count(added: Count, capacity: int) -> Int[Array, ""]:
+def count(added: Whole, capacity: int) -> Int[Array, ""]:
     """The `added` rows, less whole turns of a full ring: position and fullness stay, and int32 never overflows."""
     return jnp.where(added < capacity, added, capacity + added % capacity)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from vecpsmbpo import networks, optim
 from vecpsmbpo.settings.parts import SacSettings
-from vecpsmbpo.types import Count, EnvSpec, Hyper, Number, Params, Stats, Transition
+from vecpsmbpo.types import EnvSpec, Hyper, Number, Params, Stats, Transition, Whole
 
 
 class SacStats(Stats):
@@ -90,7 +90,7 @@ def init(key: PRNGKeyArray, nets: Networks, spec: EnvSpec) -> Agent:
     )
 
 
-def learning_rate(settings: SacSettings, first: Number, env_steps: Count) -> Number:
+def learning_rate(settings: SacSettings, first: Number, env_steps: Whole) -> Number:
     """What Adam steps with after `env_steps`: on a line from `first` to a share of it, `policy_learning_rate_decay`.
 
     Large steps find a policy, and small ones tell apart actions whose values differ by less than the noise that large

@@ -15,11 +15,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vecpsmbpo.settings import Settings
 
-# Signatures give shapes in these letters, `*batch` for any leading axes: Float[Array, "*batch O"]. Tests check them
-# where functions are traced (tests/shapes.py); a run does not.
+# Signatures give shapes in these letters, `*batch` for any leading axes: Float[Array, "*batch O"]. Others (H, K, D) are
+# the function's own. Tests check them where functions are traced (tests/shapes.py); a run does not.
 Params = Any  # a pytree of arrays
-Number = Float[Array, ""] | float
-Count = Int[Array, ""] | int
+Number = Float[Array, ""] | float  # scalars, traced or not
+Whole = Int[Array, ""] | int
 Flag = Bool[Array, ""] | bool
 TerminationRule = Callable[
     [Float[Array, "*batch O"], Float[Array, "*batch A"], Float[Array, "*batch O"]], Bool[Array, "*batch"]

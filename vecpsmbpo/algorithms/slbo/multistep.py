@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from vecpsmbpo import dynamics, networks, optim, replay
 from vecpsmbpo.algorithms.slbo.settings import SlboSettings
-from vecpsmbpo.types import Count, EnvSpec, Hyper, Model, Transition
+from vecpsmbpo.types import EnvSpec, Hyper, Model, Transition, Whole
 
 
 def loss(
@@ -47,7 +47,7 @@ def loss(
 
 
 def sequences(
-    real: Float[Array, "C F"], rows: Count, key: PRNGKeyArray, settings: SlboSettings, spec: EnvSpec
+    real: Float[Array, "C F"], rows: Whole, key: PRNGKeyArray, settings: SlboSettings, spec: EnvSpec
 ) -> tuple[Transition, Bool[Array, "B H"]]:
     """A batch of H consecutive rows of D_E, leaves [B, H, ...], and where each continues the one before.
 
@@ -63,7 +63,7 @@ def sequences(
 def fit(
     model: Model,
     real: Float[Array, "C F"],
-    rows: Count,
+    rows: Whole,
     hyper: Hyper,
     key: PRNGKeyArray,
     *,

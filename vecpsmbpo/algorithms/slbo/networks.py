@@ -1,5 +1,6 @@
 """SLBO's networks: TRPO's policy and value function."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +12,8 @@ from vecpsmbpo.types import Params
 
 
 class TanhMLP(nn.Module):
-    """Dense layers with tanh between them, and a linear output that begins near 0."""
+    """Dense layers with tanh between them, and a linear output that begins near 0. Products are float32 on every
+    device, whatever `network_precision`: conjugate gradients need the bits."""
 
     output_size: int
     hidden_size: int
@@ -19,9 +21,10 @@ class TanhMLP(nn.Module):
 
     @nn.compact
     def __call__(self, hidden: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
+        dense = partial(nn.Dense, precision=jax.lax.Precision.HIGHEST)
         for _ in range(self.hidden_layers):
-            hidden = nn.tanh(nn.Dense(self.hidden_size, kernel_init=nn.initializers.orthogonal(2**0.5))(hidden))
-        return nn.Dense(self.output_size, kernel_init=nn.initializers.orthogonal(0.01))(hidden)
+            hidden = nn.tanh(dense(self.hidden_size, kernel_init=nn.initializers.orthogonal(2**0.5))(hidden))
+        return dense(self.output_size, kernel_init=nn.initializers.orthogonal(0.01))(hidden)
 
 
 class Normal(NamedTuple):

@@ -110,7 +110,10 @@ def divergence(policy: Params, old: Params, obs: Float[Array, "K O"], *, nets: N
 def natural_direction(
     policy: Params, gradient: Float[Array, " D"], obs: Float[Array, "K O"], *, nets: Networks
 ) -> tuple[Float[Array, " D"], Any]:
-    """(F + damping)⁻¹ gradient by conjugate gradients, and F + damping as a function; F is the Hessian of the KL."""
+    """(F + damping)⁻¹ gradient by conjugate gradients, and F + damping as a function; F is the Hessian of the KL.
+
+    gradient: of the parameters as one vector.
+    """
     flat, unravel = ravel_pytree(policy)
     slope = jax.grad(lambda x: divergence(unravel(x), policy, obs, nets=nets))
 
