@@ -22,7 +22,8 @@ class Jobs(Launcher):
         }
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        self._context, self._task, self._config = hydra_context, task_function, config
+        self._context, self._config = hydra_context, config
+        self._task: Any = task_function  # of `cli`, which keeps the exit status
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         from vecpsmbpo.sweeps import launch
