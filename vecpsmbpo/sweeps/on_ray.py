@@ -36,8 +36,9 @@ class Tasks:
             # A process for each: what a run leaves in JAX and on a GPU is not for the next one.
             remote = ray.remote(max_calls=1, retry_exceptions=[Preempted], **options["remote"])(_job)
             self._tasks = [remote.remote(run) for run in runs]
-        except (ConnectionError, ValueError, TypeError, RuntimeError) as error:
-            raise SettingError(f"hydra/launcher=ray: {words.of(error)}") from None
+        except Exception as error:  # a cluster that does not start, or does not answer, raises just that
+            said = str(error).strip().splitlines() or [type(error).__name__]
+            raise SettingError(f"hydra/launcher=ray: {said[0]}") from None
 
     def look(self) -> list[Outcome | str]:
         ended, _ = ray.wait(self._tasks, num_returns=len(self._tasks), timeout=0)
