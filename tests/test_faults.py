@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from tests.helpers import environment, tiny
-from vecpsmbpo import cli, config, envs, runtime, words
+from vecpsmbpo import cli, config, envs, runtime, stopping, words
 from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.training import guards
 from vecpsmbpo.types import EnvSpec
 
 SUITE = ["env=gymnasium", "backend=host"]
@@ -180,7 +179,7 @@ def test_what_the_system_refuses_is_one_line(monkeypatch, capsys):
 def test_signals_that_ask_a_run_to_stop(number, capfd):
     before = signal.signal(number, signal.SIG_DFL)  # also where the tests run under nohup
     try:
-        with guards.heeding_signals() as stop:
+        with stopping.heeding_signals() as stop:
             os.kill(os.getpid(), number)
             assert stop.requested == number
     finally:
@@ -191,7 +190,7 @@ def test_signals_that_ask_a_run_to_stop(number, capfd):
 def test_a_run_under_nohup_outlives_its_terminal():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with guards.heeding_signals() as stop:
+        with stopping.heeding_signals() as stop:
             os.kill(os.getpid(), signal.SIGHUP)
             assert stop.requested is None
     finally:

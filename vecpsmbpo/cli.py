@@ -140,24 +140,21 @@ def _run(settings: Settings) -> int:
         os._exit(2)
 
 
-def _multirun(overrides: list[str]) -> int:
-    """Hydra's own multirun, so that its sweepers and launchers work.
+class _Task:
+    """What Hydra calls for each run of a grid that is run in this process.
 
-    A run that cannot be made, or has frozen lanes, does not take the others with it; the exit status is the worst of
-    all. A signal stops them all.
+    Attributes:
+        worst: the exit status of all runs so far, those of a launcher (`hydra_plugins.vecpsmbpo`) included.
     """
-    import hydra
 
-    from vecpsmbpo import config
+    def __init__(self) -> None:
+        self.worst = 0
 
-    config.parse(overrides, sweep=True)
-
-    worst = 0
-
-    def task(tree) -> None:
+    def __call__(self, tree: Any) -> None:
         from hydra.core.hydra_config import HydraConfig
 
-        nonlocal worst
+        from vecpsmbpo import config
+
         try:
             status = _run(config.resolve(list(HydraConfig.get().overrides.task), tree))
         except SettingError as error:
@@ -165,14 +162,37 @@ def _multirun(overrides: list[str]) -> int:
             status = 2
         if status > 2:
             sys.exit(status)
-        worst = max(worst, status)
+        self.worst = max(self.worst, status)
 
+
+def _multirun(overrides: list[str]) -> int:
+    """Hydra's own multirun, so that its sweepers and launchers work.
+
+    A run that cannot be made, or has frozen lanes, does not take the others with it; the exit status is the worst of
+    all. A signal stops them all.
+    """
+    import hydra
+    from hydra.core.plugins import Plugins
+
+    from hydra_plugins.vecpsmbpo import Jobs
+    from vecpsmbpo import config
+    from vecpsmbpo.sweeps import launch
+    from vecpsmbpo.sweeps.job import Elsewhere
+
+    config.parse(overrides, sweep=True)
+    launch.check(overrides)
+    Plugins.instance().register(Jobs)  # by hand, since Hydra finds none in an editable installation
+    task = _Task()
     sys.argv = ["vecpsmbpo", "--multirun", *config.for_hydra(overrides)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves its errors to us
-    with config.hydra_errors(), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=r"\s*Running Hydra app with --multirun")
-        hydra.main(version_base="1.3", config_path="pkg://vecpsmbpo.configs", config_name="config")(task)()
-    return worst
+    try:
+        with config.hydra_errors(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=r"\s*Running Hydra app with --multirun")
+            hydra.main(version_base="1.3", config_path="pkg://vecpsmbpo.configs", config_name="config")(task)()
+    except Elsewhere as error:
+        print(f"vecpsmbpo: {error}", file=sys.stderr)
+        return 130
+    return task.worst
 
 
 def _eval(rest: list[str]) -> int:

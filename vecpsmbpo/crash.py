@@ -18,7 +18,9 @@ from vecpsmbpo import versions
 ADVICE = "try devices=1, compile_cache=false, or another Python (which brings another jax)"
 REPORT = "crash.txt"  # in the run directory: Python's stack
 _FATAL, _REPORT, _END = "Fatal Python error: ", "report: ", "the end"
-_NOT_FOR_THE_WATCHER = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
+# The last two are Slurm's, which sends them to all processes of a job.
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR2", "SIGCONT")
+_NOT_FOR_THE_WATCHER = {getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)}
 _pipe: int | None = None
 
 

@@ -1,15 +1,10 @@
-"""What stands around a run: signals that stop it, the lock on its directory, and a disk that cannot be written."""
+"""What stands around a run: the lock on its directory, and a disk that cannot be written."""
 
 import contextlib
-import dataclasses
 import errno
 import os
-import signal
-import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from vecpsmbpo.settings import SettingError
 
@@ -28,53 +23,6 @@ DISK_ERRORS = frozenset(
 
 class DiskError(Exception):
     """The run directory cannot be written; the last checkpoint is whole."""
-
-
-@dataclasses.dataclass
-class Stop:
-    """The signal that asked the run to stop, if one did."""
-
-    requested: int | None = None
-
-
-@contextlib.contextmanager
-def heeding_signals() -> Iterator[Stop]:
-    """SIGINT, SIGTERM and SIGHUP ask the run to stop after its chunk; a second one stops it at once. SIGHUP that is
-    ignored, as `nohup` has it, stays so.
-
-    Only the main thread of a program may say what signals do; in another one they stay what they are.
-    """
-    stop = Stop()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def ask(number: int, frame: Any) -> None:
-        if stop.requested is not None:
-            raise KeyboardInterrupt
-        stop.requested = number
-        try:
-            print("\nfinishing this chunk and saving; once more to stop at once", file=sys.stderr, flush=True)
-        except OSError:  # the terminal is gone, and must not take the run with it
-            _speak_to_nobody()
-
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
-    before = {number: signal.signal(number, ask) for number in numbers}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _speak_to_nobody() -> None:
-    """Whatever is printed from now on is lost."""
-    nobody = os.open(os.devnull, os.O_WRONLY)
-    for stream in (1, 2):
-        os.dup2(nobody, stream)
-    os.close(nobody)
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """The one loop that does input and output: chunks of the compiled program, and what is kept of them."""
 
+import contextlib
 import shlex
 import sys
 import time
@@ -15,7 +16,8 @@ from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.look import report
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.training.guards import Stop, alone_in, disk_errors, heeding_signals
+from vecpsmbpo.stopping import Stop, heeding_signals
+from vecpsmbpo.training.guards import alone_in, disk_errors
 from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
@@ -23,8 +25,11 @@ from vecpsmbpo.types import EpisodeEnd, TrainState
 LONG_EPOCH_S = 20.0
 
 
-def train(settings: Settings) -> int:
+def train(settings: Settings, stop: Stop | None = None) -> int:
     """Runs, or goes on with, the run in `settings.run_dir`.
+
+    Args:
+        stop: where whoever heeds the signals writes them down; without it, they are heeded here.
 
     Returns:
         0, 1 where a lane is frozen (`health`) or a simulator failed, or 128 + the number of the signal that stopped it.
@@ -41,7 +46,8 @@ def train(settings: Settings) -> int:
     run_dir = Path(settings.run_dir)
     with disk_errors(run_dir):
         run_dir.mkdir(parents=True, exist_ok=True)
-        with alone_in(run_dir), heeding_signals() as stop:
+        heeded = heeding_signals() if stop is None else contextlib.nullcontext(stop)
+        with alone_in(run_dir), heeded as stop:
             _check_not_emptied(run_dir)
             crash.doing("making the first state", run_dir)
             return _Session(settings, driver, shapes, memory).go(stop)
@@ -93,6 +99,9 @@ class _Session:
                 self._compile()
                 while self.env_steps < settings.total_steps and not stop.requested and not self.frozen.all():
                     self._chunk()
+                    if stop.save:
+                        stop.save = False
+                        self._save()
                 self._save()
                 return self._farewell(stop)
         except Interrupted as error:

@@ -1,0 +1,103 @@
+"""The signals that a run heeds. Imports no JAX: what only watches runs heeds them, too."""
+
+import contextlib
+import dataclasses
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from types import FrameType
+from typing import Any
+
+Handler = Callable[[int, FrameType | None], Any]
+FINISHING = "finishing this chunk and saving; once more to stop at once"
+
+
+@dataclasses.dataclass
+class Stop:
+    """What signals have asked for: `requested`, the one that asked to stop; `save`, to save and go on."""
+
+    requested: int | None = None
+    save: bool = False
+
+
+@contextlib.contextmanager
+def heeding_signals(words: str = FINISHING) -> Iterator[Stop]:
+    """SIGINT, SIGTERM and SIGHUP ask to stop, by default a run after its chunk; a second one stops it at once. SIGHUP
+    that is ignored, as `nohup` has it, stays so.
+
+    Only the main thread of a program may say what signals do; in another one they stay what they are.
+
+    Args:
+        words: said at the first signal.
+    """
+    stop = Stop()
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if stop.requested is not None:
+            raise KeyboardInterrupt
+        stop.requested = number
+        _say(words)
+
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    with _handling(dict.fromkeys(numbers, ask)):
+        yield stop
+
+
+@contextlib.contextmanager
+def heeding_submitit(*, slurm: bool) -> Iterator[Stop]:
+    """In a job of submitit's. SIGUSR2, which comes before its time is over or it is preempted, asks to stop.
+
+    SIGTERM does, too, on this machine. Slurm sends it before it preempts or cancels a job, and then the run saves and
+    goes on for as long as it is let: Slurm queues a preempted job again if it has not ended by itself, and a run cannot
+    know whether it is being cancelled.
+    """
+    stop = Stop()
+
+    def make_room(number: int, frame: FrameType | None) -> None:
+        stop.requested = number  # Slurm may say it twice, for two reasons
+        _say("finishing this chunk and saving, to go on later")
+
+    def end(number: int, frame: FrameType | None) -> None:
+        if stop.requested is not None:
+            raise KeyboardInterrupt
+        stop.requested = number
+        _say(FINISHING)
+
+    def save(number: int, frame: FrameType | None) -> None:
+        stop.save = True
+        _say("saving after this chunk")
+
+    with _handling({signal.SIGUSR2: make_room, signal.SIGTERM: save if slurm else end}):
+        yield stop
+
+
+@contextlib.contextmanager
+def _handling(handlers: Mapping[int, Handler]) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _say(words: str) -> None:
+    try:
+        print(f"\n{words}", file=sys.stderr, flush=True)
+    except OSError:  # the terminal is gone, and must not take the run with it
+        _speak_to_nobody()
+
+
+def _speak_to_nobody() -> None:
+    """Whatever is printed from now on is lost."""
+    nobody = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nobody, stream)
+    os.close(nobody)

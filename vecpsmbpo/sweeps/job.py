@@ -1,0 +1,84 @@
+"""What a job does, wherever it is: one run."""
+
+import dataclasses
+import os
+import sys
+import traceback
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Protocol
+
+from vecpsmbpo import words
+from vecpsmbpo.settings import SettingError, Settings
+from vecpsmbpo.stopping import Stop
+
+METRICS_FILE = "metrics.jsonl"
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What is sent to where the job runs.
+
+    Attributes:
+        settings: resolved where the command was given.
+        folder: where that was. It, and the run directory, must be the same for all machines.
+    """
+
+    settings: Settings
+    folder: Path
+
+    @property
+    def metrics(self) -> Path:
+        return self.folder / self.settings.run_dir / METRICS_FILE
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a job ended: the exit status that its run alone would have had, and a line where there is more to say."""
+
+    status: int
+    said: str = ""
+
+
+class Jobs(Protocol):
+    """The jobs of a grid, in a cluster."""
+
+    def look(self) -> list[Outcome | str]:
+        """Of each how it ended, or, while it has not, what it is doing in a word."""
+
+    def stop(self) -> None:
+        """Asks all of them to save and end. Is not called again before `look` has been.
+
+        Raises:
+            Elsewhere: they are not this process's to end.
+        """
+
+
+class Elsewhere(Exception):
+    """Jobs that go on without whoever watches them; says how to end them."""
+
+
+def train(run: Run, heeding: AbstractContextManager[Stop]) -> Outcome:
+    """Trains to the end, or a signal. Nothing that goes wrong leaves as an exception: an outcome reaches whoever waits
+    for it in one piece."""
+    os.chdir(run.folder)
+    with heeding as stop:
+        try:
+            from vecpsmbpo import runtime
+            from vecpsmbpo.training import DiskError
+            from vecpsmbpo.training import train as train_here
+        except ImportError as error:
+            return _failed(1, words.of(error))
+        try:
+            runtime.check_flags()
+            return Outcome(train_here(run.settings, stop))
+        except (SettingError, DiskError) as error:
+            return _failed(2, str(error))
+        except Exception as error:
+            traceback.print_exc()
+            return _failed(1, words.of(error))
+
+
+def _failed(status: int, said: str) -> Outcome:
+    print(f"vecpsmbpo: {said}", file=sys.stderr, flush=True)
+    return Outcome(status, said)
