@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.helpers import argv, environment
 from tools.careless import COMMANDS, MODULES
-from vecpsmbpo import cli, metrics
+from vecpsmbpo import cli, jsonl
 
 OUT = Path("results/faults.csv")
 RUN = ["size=tiny", "env=ball_in_cup", "loggers=[]"]  # 40 steps an epoch, a checkpoint each
@@ -50,10 +50,8 @@ FINE = (SAME, ONE_LINE)
 def lines(run_dir: Path) -> list[dict]:
     """Of both logs, without what depends on the clock."""
     clock = {"env_steps_per_s", "updates_per_s", "imagined_per_s", "seconds", "compile_seconds"}
-    files = (metrics.METRICS_FILE, metrics.EPISODES_FILE)
-    return [
-        {k: v for k, v in line.items() if k not in clock} for name in files for line in metrics.read(run_dir / name)
-    ]
+    files = (jsonl.METRICS_FILE, jsonl.EPISODES_FILE)
+    return [{k: v for k, v in line.items() if k not in clock} for name in files for line in jsonl.read(run_dir / name)]
 
 
 def arrays(run_dir: Path) -> int:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vecpsmbpo import metrics, versions
+from vecpsmbpo import jsonl, versions
 
 HERE = Path(__file__).resolve().parent
 SAVING_S = 90  # that a run is given to save after it was asked to stop
@@ -95,7 +95,7 @@ def train(part: Part, out: Path, seconds: float, tiny: bool) -> str:
         status = process.wait(max(seconds - SAVING_S, 1) if not tiny else None)
     except subprocess.TimeoutExpired:
         status = stopped(process)
-    lines = [line for line in metrics.read(run_dir / metrics.METRICS_FILE) if line["eval_return"] is not None]
+    lines = [line for line in jsonl.read(run_dir / jsonl.METRICS_FILE) if line["eval_return"] is not None]
     if not lines:
         return "to go on, before its first epoch" if status == INTERRUPTED else f"FAILED with status {status}"
     last, evaluated = lines[-1], [line["eval_return"] for line in lines]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import config, dynamics
+from vecpsmbpo import config, dynamics, jsonl
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.evaluate import evaluate
 from vecpsmbpo.look import members, runs
@@ -94,12 +94,12 @@ class Run:
     @property
     def metrics(self) -> Table:
         """A row per epoch and lane: metrics.jsonl as it is now."""
-        return _table(runs.read(self.run_dir / runs.METRICS_FILE).columns)
+        return _table(runs.read(self.run_dir / jsonl.METRICS_FILE).columns)
 
     @property
     def episodes(self) -> Table:
         """A row per finished real episode: episodes.jsonl as it is now. `probs` are the N·M members' in a row."""
-        return _table(runs.read(self.run_dir / runs.EPISODES_FILE).columns)
+        return _table(runs.read(self.run_dir / jsonl.EPISODES_FILE).columns)
 
     @property
     def env_steps(self) -> int:

@@ -13,13 +13,12 @@ import jax
 import numpy as np
 
 from vecpsmbpo import jsonl, mixture
-from vecpsmbpo.jsonl import Line
+from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE, Line
 from vecpsmbpo.loggers import Loggers
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.settings.parts import PosteriorSettings
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
-METRICS_FILE, EPISODES_FILE = "metrics.jsonl", "episodes.jsonl"
 SESSIONS_FILE = "sessions.jsonl"
 LEARNED = ("critic_loss", "actor_loss", "alpha", "q_mean", "entropy")  # in every line, null where nothing learns so
 read = jsonl.read

@@ -13,9 +13,10 @@ import numpy as np
 
 from vecpsmbpo import config
 from vecpsmbpo.algorithms.catalogue import of_algorithm
+from vecpsmbpo.jsonl import METRICS_FILE
 from vecpsmbpo.look import arguments, compare, diagnose, files, groups, runs, statistics
 from vecpsmbpo.look.curves import AXES, curve
-from vecpsmbpo.look.runs import METRICS_FILE, Lane, Run
+from vecpsmbpo.look.runs import Lane, Run
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.settings.parts import PosteriorSettings
 

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from vecpsmbpo import config, jsonl
+from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE
 from vecpsmbpo.settings import SettingError, Settings
-
-METRICS_FILE, EPISODES_FILE = "metrics.jsonl", "episodes.jsonl"
 
 Array = np.ndarray
 Columns = dict[str, Array]

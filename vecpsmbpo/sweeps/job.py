@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Protocol
 
 from vecpsmbpo import words
+from vecpsmbpo.jsonl import METRICS_FILE
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.stopping import Stop
-
-METRICS_FILE = "metrics.jsonl"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -299,7 +299,7 @@ def _check_not_emptied(run_dir: Path) -> None:
     SettingError: there are logs of a run, and no checkpoints: beginning anew would write over them.
     """
     if not any(path.name.isdecimal() for path in (run_dir / checkpoint.FOLDER).glob("*")):
-        files = (metrics.METRICS_FILE, metrics.EPISODES_FILE)
+        files = (jsonl.METRICS_FILE, jsonl.EPISODES_FILE)
         done = max((line[jsonl.STEP] for name in files for line in metrics.read(run_dir / name)), default=0)
         if done:
             raise SettingError(
