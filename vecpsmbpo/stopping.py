@@ -33,17 +33,10 @@ def heeding_signals(words: str = FINISHING) -> Iterator[Stop]:
         words: said at the first signal.
     """
     stop = Stop()
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        if stop.requested is not None:
-            raise KeyboardInterrupt
-        stop.requested = number
-        _say(words)
-
     numbers = [signal.SIGINT, signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
-    with _handling(dict.fromkeys(numbers, ask)):
+    with _handling(dict.fromkeys(numbers, _asking(stop, words))):
         yield stop
 
 
@@ -61,18 +54,24 @@ def heeding_submitit(*, slurm: bool) -> Iterator[Stop]:
         stop.requested = number  # Slurm may say it twice, for two reasons
         _say("finishing this chunk and saving, to go on later")
 
-    def end(number: int, frame: FrameType | None) -> None:
-        if stop.requested is not None:
-            raise KeyboardInterrupt
-        stop.requested = number
-        _say(FINISHING)
-
     def save(number: int, frame: FrameType | None) -> None:
         stop.save = True
         _say("saving after this chunk")
 
-    with _handling({signal.SIGUSR2: make_room, signal.SIGTERM: save if slurm else end}):
+    with _handling({signal.SIGUSR2: make_room, signal.SIGTERM: save if slurm else _asking(stop, FINISHING)}):
         yield stop
+
+
+def _asking(stop: Stop, words: str) -> Handler:
+    """Asks to stop, and says so; the second time, stops at once."""
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if stop.requested is not None:
+            raise KeyboardInterrupt
+        stop.requested = number
+        _say(words)
+
+    return ask
 
 
 @contextlib.contextmanager
