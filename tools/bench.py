@@ -43,9 +43,9 @@ PAPER = [
     "horizon_last=1",
     "warmup_steps=250",
 ]
+SMALL = ["env=cartpole_swingup", "size=cpu", "warmup_steps=250", "rollout_starts=2500"]
 WORLD_STRIDES = 4
 PROFILE_SECONDS = 150  # after which a large program's strides have been timed often enough
-SMALL = ["env=cartpole_swingup", "size=cpu", "warmup_steps=250", "rollout_starts=2500"]
 
 
 def best_seconds(run: Callable[[], Any], repeats: int) -> float:
@@ -184,6 +184,7 @@ def loop_pieces(program: str) -> dict[str, int]:
         ValueError: there is no loop.
     """
     computations = dict(re.findall(r"^(?:ENTRY )?%?([\w.\-]+) \([^\n]*\{\n(.*?)^\}", program, re.M | re.S))
+    called = r"(?:calls|to_apply|body|condition|\w+_computations?)=\{?([^,}\s]+(?:, %[^,}\s]+)*)"
     seen: set[str] = set()
     waiting = re.findall(r" while\(.*body=%?([\w.\-]+)", program)
     if not waiting:
@@ -192,10 +193,8 @@ def loop_pieces(program: str) -> dict[str, int]:
         name = waiting.pop()
         if name not in seen:
             seen.add(name)
-            called = r"(?:calls|to_apply|body|condition|\w+_computations?)=\{?([^,}\s]+(?:, %[^,}\s]+)*)"
-            waiting += [
-                part.lstrip("%") for parts in re.findall(called, computations[name]) for part in parts.split(", ")
-            ]
+            for parts in re.findall(called, computations[name]):
+                waiting += [part.lstrip("%") for part in parts.split(", ")]
     body = "".join(computations[name] for name in seen)
     products = len(re.findall(r" dot\(|custom_call_target=\"[^\"]*(?:gemm|matmul)", body))
     return {"products": products, "fusions": body.count(" fusion("), "copies": body.count(" copy(")}
@@ -296,7 +295,7 @@ def timed_stride(driver: ScanDriver, state: TrainState) -> tuple[TrainState, flo
 
 def seconds_per_imagining(driver: ScanDriver, state: TrainState) -> float:
     """Of one refresh, for every member, by itself; the state is consumed, so that rings are written in place."""
-    specs = driver.layout.specs()
+    places = driver.layout.specs()
 
     def body(state: TrainState) -> TrainState:
         def imagine(counters: Any, seed: Any, key: Any) -> Any:
@@ -304,7 +303,7 @@ def seconds_per_imagining(driver: ScanDriver, state: TrainState) -> float:
 
         return state.replace(seeds=over_seeds(imagine)(state.counters, state.seeds, state.seeds.key))
 
-    run = driver.layout.jit_shard_map(body, (specs,), specs, donate_argnums=0)
+    run = driver.layout.jit_shard_map(body, (places,), places, donate_argnums=0)
     seconds = []
     for _ in range(3):  # the first compiles
         began = time.perf_counter()

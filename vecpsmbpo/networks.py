@@ -35,22 +35,16 @@ PRECISIONS = {
 }
 
 
-def outer_layer(size: int, kernel_init: Any, precision: str) -> nn.Dense:
-    """A first or last layer, of a `PRECISIONS` name: float32 whatever that is, since bfloat16 cannot tell positions of
-    0.85 that are 4 mm apart, nor values of 100 that are half a unit apart."""
-    return nn.Dense(size, dtype=jnp.float32, precision=PRECISIONS[precision].products, kernel_init=kernel_init)
-
-
-def inner_layer(size: int, kernel_init: Any, precision: str) -> nn.Dense:
-    """A layer between the first and the last."""
+def layer(size: int, kernel_init: Any, precision: str, *, inner: bool = False) -> nn.Dense:
+    """A dense layer, of a `PRECISIONS` name. The first and the last of a network are float32 whatever that is, since
+    bfloat16 cannot tell positions of 0.85 that are 4 mm apart, nor values of 100 that are half a unit apart."""
     dtype, products = PRECISIONS[precision]
-    return nn.Dense(size, dtype=dtype, precision=products, kernel_init=kernel_init)
+    return nn.Dense(size, dtype=dtype if inner else jnp.float32, precision=products, kernel_init=kernel_init)
 
 
 def hidden_layer(index: int, hidden: jax.Array, size: int, kernel_init: Any, precision: str) -> jax.Array:
     """What goes into the activation function of hidden layer `index`, from 0."""
-    layer = inner_layer if index else outer_layer
-    return layer(size, kernel_init, precision)(hidden).astype(PRECISIONS[precision].dtype)
+    return layer(size, kernel_init, precision, inner=index > 0)(hidden).astype(PRECISIONS[precision].dtype)
 
 
 model_init = nn.initializers.variance_scaling(1.0, "fan_in", "truncated_normal")
@@ -90,7 +84,7 @@ class GaussianMLP(nn.Module):
         hidden = inputs
         for index in range(self.hidden_layers):
             hidden = nn.swish(hidden_layer(index, hidden, self.hidden_size, model_init, self.precision))
-        return outer_layer(2 * self.output_size + self.predicts_termination, model_init, self.precision)(hidden)
+        return layer(2 * self.output_size + self.predicts_termination, model_init, self.precision)(hidden)
 
     def __call__(
         self,
@@ -149,7 +143,7 @@ class ReluMLP(nn.Module):
         for index in range(self.hidden_layers):
             hidden = hidden_layer(index, hidden, self.hidden_size, policy_init, self.precision)
             hidden = nn.relu(NORMS[self.norm](hidden))
-        return outer_layer(self.output_size, policy_init, self.precision)(hidden)
+        return layer(self.output_size, policy_init, self.precision)(hidden)
 
 
 class TanhGaussian(NamedTuple):
