@@ -167,7 +167,7 @@ def test_the_smaller_critic_speaks():
     nets = sac.make_networks(tiny(), SPEC)
     agents = [sac.init(jax.random.key(seed), nets, SPEC) for seed in (0, 1)]
     critics = jax.tree.map(lambda *xs: jnp.stack(xs), *(agent.critic for agent in agents))
-    obs, action = np.random.default_rng(0).normal(size=(2, 2, 30, 1)).astype(np.float32)
+    obs, action = jax.random.normal(jax.random.key(2), (2, 2, 30, 1))
     found = diagnostics.values(critics, obs, action, nets=nets)
     for index, agent in enumerate(agents):
         expected = np.minimum(*nets.critic.values(agent.critic, obs[index], action[index]))

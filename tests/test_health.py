@@ -195,7 +195,7 @@ def test_what_a_simulator_returns_is_stored_only_if_it_is_finite(healthy):
         stored = np.asarray(state.seeds.real[lane, :steps])
         assert np.isfinite(stored).all()
         again = np.concatenate([[(stored[0] == 0).all()], (stored[1:] == stored[:-1]).all(axis=1)])
-        rows = replay.unpack(stored, 1, 1)
+        rows = jax.tree.map(np.asarray, replay.unpack(jnp.asarray(stored), 1, 1))
         np.testing.assert_allclose(rows.reward, rows.obs[:, 0] * (1 - rows.action[:, 0] ** 2), atol=1e-6)
         end = 0
         for line in (line for line in lines if line["policy_learning_rate"] == rate):

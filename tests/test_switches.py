@@ -344,7 +344,7 @@ def test_members_may_be_drawn_by_what_their_critics_promise(valued):
     nets, start = sac.make_networks(settings, spec), jnp.zeros(1)  # where every episode begins
     for member, found in enumerate(values(state.seeds)):
         agent = jax.tree.map(lambda x, member=member: x[0, member], state.seeds.agents)
-        action = np.tanh(nets.actor.distribution(agent.actor, start).loc)
+        action = jnp.tanh(nets.actor.distribution(agent.actor, start).loc)
         by_hand = np.min(nets.critic.values(agent.critic, start, action))
         assert found == pytest.approx(max(by_hand, 0.0), rel=1e-4)
 

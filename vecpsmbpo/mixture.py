@@ -22,7 +22,7 @@ def real_ratios(
     return jnp.broadcast_to(ratio, (settings.n_members,))
 
 
-def linear(mean: Number, progress: Number) -> Float[Array, ""]:
+def linear(mean: Number, progress: Float[Array, "*steps"] | float) -> Float[Array, "*steps"]:
     """λ after a share `progress` of the learning, on a line from 1 to 0 under which lies the same area as under the
     constant `mean` (figure 13).
 

@@ -68,6 +68,8 @@ def draw(logits: Float[Array, " members"], key: PRNGKeyArray) -> tuple[Int[Array
     return jax.random.categorical(key, logits), jax.nn.softmax(logits)
 
 
-def exploration_probability(forced_exploration: Number, episode: Whole) -> Float[Array, ""]:
+def exploration_probability(
+    forced_exploration: Number, episode: Int[Array, "*episodes"] | int
+) -> Float[Array, "*episodes"]:
     """min(1, τ / k): with it the k-th episode after the warm-up, from 1, takes random actions (equation 33)."""
     return jnp.minimum(1.0, forced_exploration / episode)
