@@ -118,6 +118,15 @@ def test_help_and_envs_answer_without_jax(arguments, tmp_path):
     assert "hopper" in result.stdout
 
 
+@pytest.mark.parametrize("command", cli.MODULES)
+def test_a_command_s_help_names_its_options(command, capsys):
+    assert cli.main([command, "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith(f"`vecpsmbpo {command}`")
+    assert "\n  out=" in shown
+    assert max(map(len, shown.splitlines())) <= 120
+
+
 def test_version_says_what_a_report_needs_without_jax(tmp_path):
     program = [sys.executable, "-c", WITHOUT_JAX, "--version"]
     result = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=60)

@@ -315,11 +315,11 @@ def test_the_command_repeats_itself(tmp_path, capsys):
     ("override", "line"),
     [
         ("episodes", "episodes: must be name=value"),
-        ("episode=3", "episode: no such setting of theory; one of out, seed, episodes, runs"),
+        ("episode=3", "episode=3: no such option of theory; did you mean episodes?"),
         ("episodes=1", "episodes=1: must be a whole number from 2 to 500"),
         ("runs=many", "runs=many: must be a whole number from 2 to 100000"),
         ("seed=-1", "seed=-1: must be a whole number from 0 to 2147483647"),
-        ("out=", "out=: must be a name"),
+        ("out=", "out=: must be a directory"),
     ],
 )
 def test_a_mistake_is_one_line_and_creates_nothing(override, line, tmp_path, monkeypatch):

@@ -401,8 +401,11 @@ BENCHES = {
 }
 
 if __name__ == "__main__":
+    if {"-h", "--help"} & set(sys.argv):
+        sys.exit(print(__doc__))
     if len(sys.argv) < 2 or sys.argv[1] not in BENCHES:
-        sys.exit(f"usage: bench.py {'|'.join(BENCHES)} [setting=value ...]")
+        print(f"bench: takes one of {', '.join(BENCHES)}, then settings", file=sys.stderr)
+        sys.exit(2)
     results = BENCHES[sys.argv[1]]()
     machine = {"bench": sys.argv[1], "devices": jax.device_count(), "platform": jax.default_backend()}
     for result in results if isinstance(results, list) else [results]:

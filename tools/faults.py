@@ -24,14 +24,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.helpers import argv, environment
 from tools.careless import COMMANDS, MODULES
-from vecpsmbpo import cli, jsonl
+from vecpsmbpo import arguments, cli, jsonl
+from vecpsmbpo.settings import SettingError
 
 OUT = Path("results/faults.csv")
 RUN = ["size=tiny", "env=ball_in_cup", "loggers=[]"]  # 40 steps an epoch, a checkpoint each
@@ -229,13 +230,13 @@ def kills(folder: Path, options: dict) -> Iterator[Found]:
         began = time.perf_counter()
         reference = undisturbed(folder, backend)
         longest, done, runs = time.perf_counter() - began, 0, 0
-        while done < int(options["kills"]):
+        while done < options["kills"]:
             runs += 1
             run_dir, before = f"{backend}{runs}", done
             while True:
                 process = started(*RUN, f"backend={backend}", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
                 try:
-                    process.communicate(timeout=dice.uniform(0, longest) if done < int(options["kills"]) else None)
+                    process.communicate(timeout=dice.uniform(0, longest) if done < options["kills"] else None)
                     break
                 except subprocess.TimeoutExpired:
                     process.kill()
@@ -247,10 +248,18 @@ def kills(folder: Path, options: dict) -> Iterator[Found]:
 PARTS = {part.__name__: part for part in (careless, files, signals, twice, disk, kills)}
 
 
-def main(arguments: list[str]) -> int:
-    options = {"part": ",".join(PARTS), "kills": "100", **dict(text.split("=", 1) for text in arguments)}
+OPTIONS = {
+    "part": arguments.names("which to try", *PARTS, allowed=f"of {', '.join(PARTS)}, separated by commas"),
+    "kills": arguments.whole("of each driver", 100, at_least=1),
+}
+
+
+def main(words: Sequence[str]) -> int:
+    alone, options = arguments.parse("faults", words, OPTIONS)
+    for name in (*alone, *(set(options["part"]) - set(PARTS))):
+        raise SettingError(f"{name}: no such part; part={','.join(PARTS)}")
     bad = 0
-    for name in options["part"].split(","):
+    for name in options["part"]:
         rows = []
         with tempfile.TemporaryDirectory() as folder:
             for what, ended in PARTS[name](Path(folder).resolve(), options):
@@ -273,4 +282,4 @@ def keep(part: str, rows: list[dict]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(arguments.as_tool("faults", main, __doc__, OPTIONS))

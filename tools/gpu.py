@@ -17,11 +17,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vecpsmbpo import jsonl, versions
+from vecpsmbpo import arguments, jsonl, versions
+from vecpsmbpo.settings import SettingError
 
 HERE = Path(__file__).resolve().parent
 SAVING_S = 90  # that a run is given to save after it was asked to stop
@@ -57,18 +59,22 @@ PARTS = (
 )
 
 
-def main(arguments: list[str]) -> int:
-    options = {"out": "results/gpu", "size": "paper", "minutes": "30"}
-    options |= dict(word.split("=", 1) for word in arguments if "=" in word)
-    wanted = [word for word in arguments if "=" not in word] or [part.name for part in PARTS]
-    unknown = [*(set(wanted) - {part.name for part in PARTS}), *(set(options) - {"out", "size", "minutes"})]
-    if unknown or options["size"] not in ("paper", "tiny") or not options["minutes"].replace(".", "", 1).isdigit():
-        names = " ".join(part.name for part in PARTS)
-        print(f"gpu: takes out=, size=paper|tiny, minutes=, and of these parts: {names}", file=sys.stderr)
-        return 2
-    out, tiny = Path(options["out"]), options["size"] == "tiny"
+OPTIONS = {
+    "out": arguments.out("where the figures go", "results/gpu"),
+    "size": arguments.choice("of the programs that are run", "paper", "tiny"),
+    "minutes": arguments.number("all parts together", 30.0),
+}
+
+
+def main(words: Sequence[str]) -> int:
+    wanted, options = arguments.parse("gpu", words, OPTIONS)
+    for name in wanted:
+        if name not in (part.name for part in PARTS):
+            raise SettingError(f"{name}: no such part; one of {', '.join(part.name for part in PARTS)}")
+    wanted = wanted or [part.name for part in PARTS]
+    out, tiny = options["out"], options["size"] == "tiny"
     out.mkdir(parents=True, exist_ok=True)
-    ends = time.monotonic() + 60 * float(options["minutes"])
+    ends = time.monotonic() + 60 * options["minutes"]
     failed = 0
     for part in PARTS:
         if part.name not in wanted:
@@ -171,4 +177,4 @@ def keep(part: Part, out: Path, command: list[str], found: dict[str, Any]) -> No
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(arguments.as_tool("gpu", main, __doc__, OPTIONS))

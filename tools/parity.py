@@ -17,7 +17,7 @@ For each task:
 import csv
 import itertools
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,9 @@ from rich.console import Console
 from rich.table import Table
 
 import vecpsmbpo
-from vecpsmbpo import envs
+from vecpsmbpo import arguments, envs
 from vecpsmbpo.envs import registry, termination
 from vecpsmbpo.envs.mjx.simulator import Physics
-from vecpsmbpo.settings import SettingError
 
 Policy = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]  # obs [..., O], t, key -> action [..., A]
 NEAR = 1e-4  # a state this close to a termination threshold may fall on either side in float32
@@ -249,21 +248,23 @@ def rows_of(name: str, trained: dict[str, Policy], states: int, episodes: int) -
         yield {"task": name, "states_from": "near termination", **steps}
 
 
-def main(arguments: list[str]) -> int:
-    options = dict(text.split("=", 1) for text in arguments if "=" in text and not text.startswith("run_dir="))
-    states, episodes = int(options.get("states", 2000)), int(options.get("episodes", 30))
-    output = Path(options.get("output", "results/parity.csv"))
-    try:
-        run_dirs = [text.removeprefix("run_dir=") for text in arguments if text.startswith("run_dir=")]
-        runs = [(Path(run_dir).name, *trained_policy(run_dir)) for run_dir in run_dirs]
-        names = [text for text in arguments if "=" not in text] or registry.names("mjx")
-        for name in names:
-            registry.resolve_backend(name, "mjx")
-    except SettingError as error:
-        print(f"parity.py: {error}", file=sys.stderr)
-        return 2
+OPTIONS = {
+    "states": arguments.whole("compared, of each way to come to them", 2000, at_least=1),
+    "episodes": arguments.whole("whose returns are compared", 30, at_least=1),
+    "output": arguments.out("the table", "results/parity.csv", ".csv"),
+}
+
+
+def main(words: Sequence[str]) -> int:
+    alone, options = arguments.parse("parity", words, OPTIONS)
+    states, episodes = options["states"], options["episodes"]
+    names = [word for word in alone if word in registry.TASKS] or registry.names("mjx")
+    for name in names:
+        registry.resolve_backend(name, "mjx")
+    run_dirs = [word for word in alone if word not in registry.TASKS]
+    runs = [(Path(run_dir).name, *trained_policy(run_dir)) for run_dir in run_dirs]
     rows: list[dict[str, Any]] = []
-    with output.open("w") as file:
+    with options["output"].open("w") as file:
         for name in names:
             trained = {run_dir: policy for run_dir, task, policy in runs if task == name}
             for row in rows_of(name, trained, states, episodes):
@@ -283,4 +284,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(arguments.as_tool("parity", main, __doc__, OPTIONS))

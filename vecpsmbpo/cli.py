@@ -33,6 +33,7 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo envs                                    tasks, backends, sizes
   vecpsmbpo theory                                  the paper's theory in numbers, in seconds
   vecpsmbpo --version                               of this program, jax, mujoco and Python
+  vecpsmbpo plot --help                             options of one command
 
 {groups}
 settings: {settings}
@@ -41,8 +42,9 @@ What each setting does stands beside its default in {config}.
 """
 
 
-# Commands that read runs and show them: modules of `vecpsmbpo.look`.
+# Commands that are a module each, with `OPTIONS` and `run`: those that read runs and show them, and the theory.
 LOOKS = ("plot", "compare", "report", "figure", "render", "export", "diagnose")
+MODULES = {"theory": "vecpsmbpo.theory.report", **{name: f"vecpsmbpo.look.{name}" for name in LOOKS}}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -76,26 +78,22 @@ def _dispatch(arguments: list[str]) -> int:
         print(versions.line())
         return 0
     command, rest = arguments[0], arguments[1:]
-    if "-h" in rest or "--help" in rest:
-        print(_help())
+    if {"-h", "--help"} & set(rest):
+        print(_help(command))
         return 0
     if command == "envs":
         return _envs(rest)
     if command == "eval":
         with crash.watched():
             return _eval(rest)
-    if command == "theory":
-        from vecpsmbpo.theory import report
-
-        return report.run(rest)
-    if command in LOOKS:
-        return importlib.import_module(f"vecpsmbpo.look.{command}").run(rest)
+    if command in MODULES:
+        return importlib.import_module(MODULES[command]).run(rest)
     if command == "train":
         multirun = {"-m", "--multirun"} & set(rest)
         overrides = [text for text in rest if text not in ("-m", "--multirun")]
         with crash.watched():
             return _multirun(overrides) if multirun else _train(overrides)
-    raise SettingError(f"{command}: no such command; one of train, eval, envs, theory, {', '.join(LOOKS)}")
+    raise SettingError(f"{command}: no such command; one of train, eval, envs, {', '.join(MODULES)}")
 
 
 def _train(overrides: list[str]) -> int:
@@ -228,13 +226,17 @@ def _envs(rest: list[str]) -> int:
     return 0
 
 
-def _help() -> str:
+def _help(command: str = "") -> str:
+    """Of the whole program, or of a command that has options of its own."""
     import textwrap
     from importlib import resources
 
-    from vecpsmbpo import config
+    from vecpsmbpo import arguments, config
     from vecpsmbpo.algorithms.catalogue import FIELDS
 
+    if command in MODULES:
+        module = importlib.import_module(MODULES[command])
+        return arguments.explain(command, module.__doc__ or "", module.OPTIONS)
     plain = [name for name in FIELDS if name not in config.GROUPS]
     return HELP.format(
         groups="\n".join(

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from vecpsmbpo.look import arguments, files, groups, published, runs, statistics
+from vecpsmbpo import arguments
+from vecpsmbpo.look import files, groups, published, runs, statistics
 from vecpsmbpo.look.curves import check_columns
 from vecpsmbpo.look.groups import Group
 from vecpsmbpo.look.runs import Lane, Run
@@ -21,15 +22,15 @@ from vecpsmbpo.look.statistics import Estimate
 from vecpsmbpo.settings import SettingError
 
 OPTIONS = {
-    "y": arguments.text("eval_return"),
-    "group": arguments.names(),
-    "steps": arguments.whole(0),
-    "window": arguments.whole(5, at_least=1),
-    "threshold": arguments.number(),
-    "target": arguments.number(),
-    "floor": arguments.number(),
-    "baseline": arguments.text(),
-    "out": arguments.out("", ".csv", ".md", ".txt"),
+    "y": arguments.text("the column of metrics.jsonl that is compared", "eval_return"),
+    "group": arguments.names("settings whose values make a line each; without it, those that differ between the runs"),
+    "steps": arguments.whole("up to which all are compared; 0: as far as all of a task have come", 0),
+    "window": arguments.whole("epochs at the end that count as the final ones", 5, at_least=1),
+    "threshold": arguments.number("the value after whose first epoch `steps to it` counts"),
+    "target": arguments.number("the value that counts as 1; without it, the task's own, if one is known"),
+    "floor": arguments.number("the value that counts as 0; without it, the task's own, or 0"),
+    "baseline": arguments.text("the line that the others are compared with; without it, the last"),
+    "out": arguments.out("a file for the table; without it, the screen", "", ".csv", ".md", ".txt"),
 }
 NAN = float("nan")
 UNKNOWN = Estimate(NAN, NAN, NAN)

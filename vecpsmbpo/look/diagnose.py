@@ -19,7 +19,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from vecpsmbpo.look import arguments, files, runs
+from vecpsmbpo import arguments
+from vecpsmbpo.look import files, runs
 from vecpsmbpo.look.runs import Run
 from vecpsmbpo.settings import SettingError
 
@@ -31,11 +32,13 @@ Array = np.ndarray
 FILE = "diagnostics.json"  # in a run's directory, where `report` finds it
 PARTS = ("task", "lane", "episodes", "env_steps", "models", "critics", "states", "history")  # of it, that are drawn
 OPTIONS = {
-    "episodes": arguments.whole(1, at_least=1),
-    "horizon": arguments.whole(50, at_least=1),
-    "lane": arguments.whole(0),
-    "seed": arguments.whole(0),
-    "out": arguments.out("", ".json", ".png", ".svg", ".pdf"),
+    "episodes": arguments.whole("fresh ones, of every member", 1, at_least=1),
+    "horizon": arguments.whole("steps ahead that models are asked for", 50, at_least=1),
+    "lane": arguments.whole("of which seed and swept value, counted from 0", 0),
+    "seed": arguments.whole("of the fresh episodes", 0),
+    "out": arguments.out(
+        "the numbers, or a picture of them; without it, into the run", "", ".json", ".png", ".svg", ".pdf"
+    ),
 }
 SHOWN = 1000  # states of a picture
 

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vecpsmbpo.look import arguments, dataset, files, runs
+from vecpsmbpo import arguments
+from vecpsmbpo.look import dataset, files, runs
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.settings.parts import SacSettings
 
@@ -26,10 +27,10 @@ if TYPE_CHECKING:
     from vecpsmbpo.look.members import Trained
 
 OPTIONS = {
-    "member": arguments.text("best", "best or n,m"),
-    "lane": arguments.whole(0),
-    "also": arguments.names(allowed="of jax, onnx, minari, separated by commas"),
-    "out": arguments.out("policy"),
+    "member": arguments.text("whose policy", "best", "best or n,m"),
+    "lane": arguments.whole("of which seed and swept value, counted from 0", 0),
+    "also": arguments.names("what else to write", allowed="of jax, onnx, minari, separated by commas"),
+    "out": arguments.out("where the files go", "policy"),
 }
 
 FILES = ("policy.npz", "act.py", "policy.json")

@@ -10,8 +10,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from vecpsmbpo import config
-from vecpsmbpo.look import arguments, compare, experiments, files, groups, published, states
+from vecpsmbpo import arguments, config
+from vecpsmbpo.look import compare, experiments, files, groups, published, states
 from vecpsmbpo.look.curves import AXES, Curve, curve, error_band, joined
 from vecpsmbpo.look.experiments import Experiment
 from vecpsmbpo.look.groups import Group
@@ -25,7 +25,11 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-OPTIONS = {"size": arguments.choice(*config.options("size"), default=""), "runs": arguments.out("runs")}
+OPTIONS = {
+    "size": arguments.choice("of the runs; without it, any", *config.options("size"), default=""),
+    "runs": arguments.out("where the runs are", "runs"),
+    "out": arguments.out("the picture; of table1, the table", "", ".png", ".svg", ".pdf", ".md", ".txt"),
+}
 LAST = 10  # evaluations that figure 7 averages
 STAGES = 3  # of training, in figures 8, 18 and 19
 INITIAL = 1 / 3  # of training, which figures 9 and 10 show by itself (40K of 125K steps, 100K of 300K)
@@ -45,7 +49,8 @@ def run(words: Sequence[str]) -> int:
         SettingError: a mistake in `words`, there are no runs, or the file cannot be written.
     """
     suffixes = (".md", ".txt") if "table1" in words else (".png", ".svg", ".pdf")
-    named, values = arguments.parse("figure", words, OPTIONS | {"out": arguments.out("", *suffixes)})
+    out_option = arguments.out(OPTIONS["out"].what, "", *suffixes)
+    named, values = arguments.parse("figure", words, OPTIONS | {"out": out_option})
     if len(named) != 1 or named[0] not in DRAW:
         what = f"{named[0]} is a drawing and is left out" if named and named[0] in DRAWINGS else "takes the name of one"
         raise SettingError(f"figure: {what}; one of {', '.join(DRAW)}")

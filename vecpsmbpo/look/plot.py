@@ -7,19 +7,22 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vecpsmbpo.look import arguments, files, groups, published, runs
+from vecpsmbpo import arguments
+from vecpsmbpo.look import files, groups, published, runs
 from vecpsmbpo.look.curves import AVERAGES, AXES, Curve, check_columns, curve
 from vecpsmbpo.settings import SettingError
 
 OPTIONS = {
-    "x": arguments.choice("env_steps", "seconds"),
-    "y": arguments.names("eval_return"),
-    "group": arguments.names(),
-    "average": arguments.choice(*AVERAGES),
-    "smooth": arguments.whole(1, at_least=1),
-    "reference": arguments.names(allowed=f"of {', '.join(published.REFERENCES)}, separated by commas"),
-    "title": arguments.text(),
-    "out": arguments.out("curves.png", ".png", ".svg", ".pdf", ".csv"),
+    "x": arguments.choice("the horizontal axis", "env_steps", "seconds"),
+    "y": arguments.names("columns of metrics.jsonl, a panel each", "eval_return"),
+    "group": arguments.names("settings whose values make a curve each; without it, those that differ between the runs"),
+    "average": arguments.choice("over the seeds of a curve, with its bootstrap interval", *AVERAGES),
+    "smooth": arguments.whole("epochs that a moving average spans", 1, at_least=1),
+    "reference": arguments.names(
+        "published curves to draw beside them", allowed=f"of {', '.join(published.REFERENCES)}, separated by commas"
+    ),
+    "title": arguments.text("of the picture"),
+    "out": arguments.out("the picture, or its numbers", "curves.png", ".png", ".svg", ".pdf", ".csv"),
 }
 COLUMNS = 3  # panels in a row
 

@@ -15,21 +15,22 @@ from PIL import Image, ImageDraw
 from rich.console import Console
 from rich.progress import track
 
-from vecpsmbpo.look import arguments, files, runs, stage
+from vecpsmbpo import arguments
+from vecpsmbpo.look import files, runs, stage
 from vecpsmbpo.look.runs import Run
 from vecpsmbpo.settings import SettingError
 
 Array = np.ndarray
 
 OPTIONS = {
-    "episodes": arguments.whole(1, at_least=1),
-    "member": arguments.text("best", "best, posterior, all, or n,m"),
-    "lane": arguments.whole(0),
-    "seed": arguments.whole(0),
-    "steps": arguments.wholes(),
-    "length": arguments.whole(0),
-    "width": arguments.whole(0, at_least=64),
-    "out": arguments.out("walk.mp4", ".mp4", ".gif", ".png"),
+    "episodes": arguments.whole("one after the other", 1, at_least=1),
+    "member": arguments.text("who acts", "best", "best, posterior, all, or n,m"),
+    "lane": arguments.whole("of which seed and swept value, counted from 0", 0),
+    "seed": arguments.whole("of the episodes", 0),
+    "steps": arguments.wholes("of training, whose checkpoints act side by side; without it, the newest"),
+    "length": arguments.whole("steps after which an episode is cut; 0: those of the task", 0),
+    "width": arguments.whole("of each picture in pixels; without it, as many show", 0, at_least=64),
+    "out": arguments.out("the film, or a strip of its frames", "walk.mp4", ".mp4", ".gif", ".png"),
 }
 FRAMES_PER_S = 30
 STRIP = 4  # frames of a .png, as in figure 8

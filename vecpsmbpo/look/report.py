@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vecpsmbpo import config
+from vecpsmbpo import arguments, config
 from vecpsmbpo.algorithms.catalogue import of_algorithm
 from vecpsmbpo.jsonl import METRICS_FILE
-from vecpsmbpo.look import arguments, compare, diagnose, files, groups, runs, statistics
+from vecpsmbpo.look import compare, diagnose, files, groups, runs, statistics
 from vecpsmbpo.look.curves import AXES, curve
 from vecpsmbpo.look.runs import Lane, Run
 from vecpsmbpo.settings import SettingError, Settings
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from vecpsmbpo.look.page import Page
 
 OPTIONS = {
-    "out": arguments.out("report.html", ".html"),
-    "group": arguments.names(),
-    "videos": arguments.names(allowed="files that end in .mp4 or .gif, separated by commas"),
-    "refresh": arguments.whole(0),
-    "diagnostics": arguments.choice("false", "true"),
+    "out": arguments.out("the page", "report.html", ".html"),
+    "group": arguments.names("settings whose values make a curve each; without it, those that differ between the runs"),
+    "videos": arguments.names("films to embed", allowed="files that end in .mp4 or .gif, separated by commas"),
+    "refresh": arguments.whole("seconds after which an open page looks for a newer one; 0: never", 0),
+    "diagnostics": arguments.choice("measure models and critics on fresh episodes", "false", "true"),
 }
 PAGE = "report.html"  # in the directory of a run with report=true
 REFRESH_S = 30  # after which a browser looks for a newer one, while the run goes on

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from vecpsmbpo import arguments
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.theory import example, tabular
 from vecpsmbpo.theory.tabular import Belief, Estimate
@@ -23,24 +24,22 @@ CURVE = np.linspace(0, 1, 21)
 FINE = np.linspace(0, 1, 1001)
 
 
+OPTIONS = {
+    "out": arguments.out("where theory.csv and theory.svg go", "theory"),
+    "seed": arguments.whole("of the random MDPs and of the luck in them", 0, at_most=2**31 - 1),
+    # Beyond 500 posteriors would be narrower than two cells of `tabular.GRID`.
+    "episodes": arguments.whole("K, of each MDP", 150, at_least=2, at_most=500),
+    "runs": arguments.whole("R, MDPs drawn from the prior", 100, at_least=2, at_most=100_000),
+}
+
+
 class Options(NamedTuple):
-    """What the command may be told.
+    """What the command was told: `OPTIONS`."""
 
-    Attributes:
-        out: directory of the files.
-        seed: of the random MDPs and of the luck in them.
-        episodes: K.
-        runs: R, MDPs drawn from the prior.
-    """
-
-    out: str = "theory"
-    seed: int = 0
-    episodes: int = 150
-    runs: int = 100
-
-
-# Beyond 500 episodes posteriors would be narrower than two cells of `tabular.GRID`.
-RANGES = {"seed": (0, 2**31 - 1), "episodes": (2, 500), "runs": (2, 100_000)}
+    out: Path
+    seed: int
+    episodes: int
+    runs: int
 
 
 class Arm(NamedTuple):
@@ -107,14 +106,17 @@ class Experiment(NamedTuple):
         return self.arms[tabular.EXACT.name][0]
 
 
-def run(overrides: list[str]) -> int:
+def run(words: Sequence[str]) -> int:
     """Runs the command; prints tables and writes `theory.csv` and `theory.svg`. The exit status.
 
     Raises:
-        SettingError: a mistake in `overrides`, or `out` cannot be written.
+        SettingError: a mistake in `words`, or `out` cannot be written.
     """
-    options = parse(overrides)
-    folder = Path(options.out)
+    alone, values = arguments.parse("theory", words, OPTIONS)
+    if alone:
+        raise SettingError(f"{alone[0]}: must be name=value")
+    options = Options(**values)
+    folder = options.out
     console = Console(highlight=False, width=118)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -128,32 +130,6 @@ def run(overrides: list[str]) -> int:
         raise SettingError(f"out={options.out}: cannot be written ({error.strerror})") from None
     console.print(f"written: {folder / 'theory.csv'}, {folder / 'theory.svg'}", markup=False)
     return 0
-
-
-def parse(overrides: Sequence[str]) -> Options:
-    """Options from `name=value` each.
-
-    Raises:
-        SettingError: what is wrong with the first wrong one.
-    """
-    values: dict[str, str | int] = {}
-    for text in overrides:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise SettingError(f"{text}: must be name=value")
-        if name not in Options._fields:
-            raise SettingError(f"{name}: no such setting of theory; one of {', '.join(Options._fields)}")
-        if name == "out":
-            if not value:
-                raise SettingError("out=: must be a name")
-            values[name] = value
-            continue
-        low, high = RANGES[name]
-        # isdecimal before int: int() also takes 1_0, " 1" and other spellings.
-        if not (value.isascii() and value.isdecimal() and low <= int(value) <= high):
-            raise SettingError(f"{text}: must be a whole number from {low} to {high}")
-        values[name] = int(value)
-    return Options(**values)  # type: ignore[arg-type]
 
 
 def compute(options: Options) -> Experiment:

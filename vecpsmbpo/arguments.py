@@ -1,5 +1,7 @@
-"""What the commands of this package may be told: run directories, and `name=value` each."""
+"""What the commands of this package and its tools may be told: words by themselves, and `name=value` each."""
 
+import sys
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,64 +14,71 @@ class Option(NamedTuple):
     """A `name=value`.
 
     Attributes:
+        what: it is for, in words.
         default: where it is not given.
         read: the value from its text; a ValueError says that it cannot be.
         allowed: what the value may be, in words.
     """
 
+    what: str
     default: Any
     read: Callable[[str], Any]
     allowed: str
 
 
-def text(default: str = "", allowed: str = "a name") -> Option:
-    return Option(default, _filled, allowed)
+def text(what: str, default: str = "", allowed: str = "a name") -> Option:
+    return Option(what, default, _filled, allowed)
 
 
-def names(*default: str, allowed: str = "names, separated by commas") -> Option:
-    return Option(default, lambda value: tuple(_filled(part) for part in value.split(",")), allowed)
+def names(what: str, *default: str, allowed: str = "names, separated by commas") -> Option:
+    return Option(what, default, lambda value: tuple(_filled(part) for part in value.split(",")), allowed)
 
 
-def choice(*options: str, default: str | None = None) -> Option:
+def choice(what: str, *options: str, default: str | None = None) -> Option:
     """One of `options`; the first is the default, unless another is given."""
     return Option(
+        what,
         options[0] if default is None else default,
         lambda value: options[options.index(value)],
         "one of " + ", ".join(options),
     )
 
 
-def whole(default: int, at_least: int = 0) -> Option:
+def whole(what: str, default: int, at_least: int = 0, at_most: int | None = None) -> Option:
     def read(value: str) -> int:
         # isdecimal before int: int() also takes 1_0, " 1" and other spellings.
         if not (value.isascii() and value.isdecimal() and int(value) >= at_least):
             raise ValueError
+        if at_most is not None and int(value) > at_most:
+            raise ValueError
         return int(value)
 
-    return Option(default, read, f"a whole number, at least {at_least}")
+    within = f", at least {at_least}" if at_most is None else f" from {at_least} to {at_most}"
+    return Option(what, default, read, f"a whole number{within}")
 
 
-def wholes() -> Option:
+def wholes(what: str) -> Option:
     """Whole numbers, none by default; `1,2` or `[1,2]`."""
-    one = whole(0)
+    one = whole(what, 0)
     return Option(
+        what,
         (),
         lambda value: tuple(one.read(part) for part in value.removeprefix("[").removesuffix("]").split(",")),
         "whole numbers, separated by commas",
     )
 
 
-def number(default: float | None = None) -> Option:
+def number(what: str, default: float | None = None) -> Option:
     def read(value: str) -> float:
         found = float(value)
         if found != found or abs(found) == float("inf"):
             raise ValueError
         return found
 
-    return Option(default, read, "a number")
+    return Option(what, default, read, "a number")
 
 
-def out(default: str, *suffixes: str) -> Option:
+def out(what: str, default: str, *suffixes: str) -> Option:
     """A file to write, of one of the kinds that `suffixes` name; without any, a directory."""
 
     def read(value: str) -> Path:
@@ -79,7 +88,7 @@ def out(default: str, *suffixes: str) -> Option:
         return path
 
     kinds = f"a file that ends in {', '.join(suffixes)}" if suffixes else "a directory"
-    return Option(Path(default) if default else None, read, kinds)
+    return Option(what, Path(default) if default else None, read, kinds)
 
 
 def _filled(value: str) -> str:
@@ -112,6 +121,38 @@ def parse(command: str, words: Sequence[str], options: Mapping[str, Option]) -> 
             except ValueError:
                 raise SettingError(f"{word}: must be {options[name].allowed}") from None
     return alone, values
+
+
+def explain(command: str, about: str, options: Mapping[str, Option]) -> str:
+    """What `--help` prints: the documentation `about` the command, and a paragraph for every option."""
+    lines = [about.strip(), "", f"options of {command}:"]
+    for name, option in options.items():
+        words = f"{option.what}; {option.allowed}"
+        lines += ["", f"  {name}={_shown(option.default)}", textwrap.fill(words, 110, **_INDENTED)]
+    return "\n".join(lines)
+
+
+def as_tool(name: str, main: Callable[[Sequence[str]], int], about: str | None, options: Mapping[str, Option]) -> int:
+    """Runs a program of `tools/` as `vecpsmbpo` runs a command: with `--help`, and one line for a mistake; its exit
+    status."""
+    words = sys.argv[1:]
+    if {"-h", "--help"} & set(words):
+        print(explain(name, about or "", options))
+        return 0
+    try:
+        return main(words)
+    except SettingError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+
+
+_INDENTED: Any = {"initial_indent": "      ", "subsequent_indent": "      "}
+
+
+def _shown(default: Any) -> str:
+    if isinstance(default, tuple):
+        return ",".join(map(str, default))
+    return "" if default is None else str(default)
 
 
 def run_dirs(command: str, words: Sequence[str], *, most: int | None = None) -> list[Path]:
