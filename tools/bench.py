@@ -7,6 +7,7 @@
     python tools/bench.py profile     where the time of an epoch and its evaluation goes (default: the quick start)
     python tools/bench.py envs        steps per second and compile seconds of every task, on each backend and batch size
     python tools/bench.py host        host simulators stepped in a loop, by threads and by processes
+    python tools/bench.py compare     one policy of MBPO, here and in mbrl-lib (bench_peer.py says what it needs)
 
 Further arguments are settings, as for `vecpsmbpo train` (of `envs`: tasks). One line of JSON per measurement.
 """
@@ -18,6 +19,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -25,13 +27,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tools import bench_peer
 from vecpsmbpo import config, envs, replay, runtime, sac
 from vecpsmbpo.algorithms.ps_mbpo.algorithm import PsMbpo
 from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.envs import registry, specs
 from vecpsmbpo.layout import SEEDS
 from vecpsmbpo.schedule import over_seeds
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.training.programs import initial_inputs, make_driver
 from vecpsmbpo.types import Hyper, TrainState
 
@@ -390,7 +395,16 @@ def bench_host() -> list[dict[str, Any]]:
     return found
 
 
+def bench_compare() -> dict[str, Any]:
+    try:
+        return bench_peer.compare(sys.argv[2:])
+    except SettingError as error:
+        print(f"bench: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
 BENCHES = {
+    "compare": bench_compare,
     "envs": bench_envs,
     "host": bench_host,
     "updates": bench_updates,
