@@ -173,20 +173,20 @@ def _arrays_sum(plain: dict[str, Any]) -> int:
 
 def _to_host(state: TrainState, layout: Layout) -> dict[str, Any]:
     rest = jax.tree.map(lambda x: np.asarray(_storable(x)), placement.unpad(layout, state.without_rings()))
-    real = placement.rings_to_host(layout, state.seeds.real)
-    imagined = placement.rings_to_host(layout, state.seeds.imagined)
-    return {"rest": rest, "real": real, "imagined": imagined}
+    rings = {name: placement.rings_to_host(layout, ring) for name, ring in state.seeds.rings().items()}
+    return {"rest": rest, **rings}
 
 
 def _shapes_on_host(shapes: TrainState, layout: Layout) -> dict[str, Any]:
     """What `_to_host` gives, as shapes."""
 
-    def rings(like: Any, count: int) -> list[Any]:
-        return [jax.ShapeDtypeStruct(like.shape[-2:], like.dtype)] * count
-
+    counts = {"real": layout.num_seeds, "imagined": layout.num_seeds * layout.n_members}
+    rings = {
+        name: [jax.ShapeDtypeStruct(ring.shape[-2:], ring.dtype)] * counts[name]
+        for name, ring in shapes.seeds.rings().items()
+    }
     rest = jax.eval_shape(lambda state: jax.tree.map(_storable, placement.unpad(layout, state)), shapes.without_rings())
-    seeds, count = shapes.seeds, layout.num_seeds
-    return {"rest": rest, "real": rings(seeds.real, count), "imagined": rings(seeds.imagined, count * layout.n_members)}
+    return {"rest": rest, **rings}
 
 
 def _from_host(plain: dict[str, Any], shapes: TrainState, layout: Layout) -> TrainState:
@@ -195,8 +195,8 @@ def _from_host(plain: dict[str, Any], shapes: TrainState, layout: Layout) -> Tra
     state = placement.place(layout, jax.tree.map(_restored, plain["rest"], rest_shapes))
     specs = layout.specs().seeds
     rings = {
-        name: placement.rings_from_host(layout, plain[name], getattr(shapes.seeds, name), getattr(specs, name))
-        for name in ("real", "imagined")
+        name: placement.rings_from_host(layout, plain[name], ring, getattr(specs, name))
+        for name, ring in shapes.seeds.rings().items()
     }
     return state.replace(seeds=state.seeds.replace(**rings))
 

@@ -65,7 +65,7 @@ def settle(layout: Layout, before: TrainState, after: TrainState) -> tuple[Train
         (before.seeds, before.env),
         (after.without_rings().seeds, after.env),
     )
-    seeds = held[0].replace(real=seeds.real, imagined=seeds.imagined, health=health)
+    seeds = held[0].replace(**seeds.rings(), health=health)
     return after.replace(seeds=seeds, env=held[1]), now
 
 

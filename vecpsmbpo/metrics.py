@@ -153,8 +153,8 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
                 "temperature": None if ratios is None else _number(seeds.hyper.temperature[seed]),
             }
         )
-        if seeds.bandit is not None:
-            bandit = jax.tree.map(lambda x, seed=seed: x[seed], seeds.bandit)
+        if ratios is not None and seeds.own.bandit is not None:
+            bandit = jax.tree.map(lambda x, seed=seed: x[seed], seeds.own.bandit)
             lines[-1]["real_ratio_probs"] = mixture.probabilities(bandit).tolist()
     return lines
 
@@ -164,7 +164,7 @@ def _real_ratios(state: TrainState, settings: Settings) -> jax.Array | None:
     if not isinstance(settings, PosteriorSettings):
         return None
     of_seed = partial(mixture.real_ratios, settings, env_steps=state.counters.env_steps)
-    return jax.vmap(lambda hyper, bandit: of_seed(hyper, bandit))(state.seeds.hyper, state.seeds.bandit)
+    return jax.vmap(lambda hyper, bandit: of_seed(hyper, bandit))(state.seeds.hyper, state.seeds.own.bandit)
 
 
 def _lane(settings: Settings, index: int) -> Line:

@@ -118,8 +118,9 @@ def check_disk(directory: Path, state: TrainState, env_steps: int, layout: Layou
 
     seeds, counters = state.seeds, state.counters
     later = env_steps > int(counters.env_steps)
-    imagined = seeds.imagined.shape[-2] if later else int(counters.imagined_rows)
-    of_members = filled(seeds.imagined, imagined) + sum(leaf.nbytes for leaf in jax.tree.leaves(seeds.agents))
+    of_members = sum(leaf.nbytes for leaf in jax.tree.leaves(seeds.agents))
+    if seeds.imagined is not None:
+        of_members += filled(seeds.imagined, seeds.imagined.shape[-2] if later else int(counters.imagined_rows))
     needed = CHECKPOINT_OVERHEAD + of_members * layout.n_members // layout.padded_members
     needed += filled(seeds.real, env_steps) + sum(leaf.nbytes for leaf in jax.tree.leaves(seeds.models))
     if shutil.disk_usage(directory).free < needed:

@@ -258,12 +258,11 @@ class SeedState(struct.PyTreeNode):
         real: [C, F], D_E: packed transitions, a ring.
         newest: [F], the row that `real` received last; zeros before the first. (Reading it from a ring that is written
             in the same step makes XLA copy the ring.)
-        imagined: [P, C_M, F], D_M^{n,m}: one ring per member.
+        imagined: [P, C_M, F], D_M^{n,m}: one ring per member; None where nothing is imagined for later.
         moments: of D_E, for whitening.
         posterior, episode: who acts, and how it is going.
-        starts: [K, O], the first observations of the last K episodes (`weights=values`), or None.
         memory: what acting remembers within an episode.
-        bandit: which chooses λ; None where nothing is chosen.
+        own: what the algorithm knows besides.
         epoch_return, epoch_episodes: [], sum and number of the returns of the episodes that ended this epoch.
         epoch_unsound: [], steps of this epoch at which the simulator returned something that is not finite.
         health: whether the lane is frozen.
@@ -275,17 +274,21 @@ class SeedState(struct.PyTreeNode):
     agents: Any
     real: jax.Array
     newest: jax.Array
-    imagined: jax.Array
+    imagined: jax.Array | None
     moments: Moments
     posterior: Posterior
     episode: Episode
-    starts: jax.Array | None
     memory: Any
-    bandit: Bandit | None
+    own: Any
     epoch_return: jax.Array
     epoch_episodes: jax.Array
     epoch_unsound: jax.Array
     health: Health
+
+    def rings(self) -> dict[str, Any]:
+        """D_E and D_M^{n,m}, those that there are: nearly all of its bytes."""
+        rings = {"real": self.real, "imagined": self.imagined}
+        return {name: ring for name, ring in rings.items() if ring is not None}
 
 
 class Counters(NamedTuple):
@@ -313,5 +316,5 @@ class TrainState(struct.PyTreeNode):
     env: Any
 
     def without_rings(self) -> "TrainState":
-        """All but D_E and D_M^{n,m}, which are nearly all of its bytes."""
+        """All but D_E and D_M^{n,m}."""
         return self.replace(seeds=self.seeds.replace(real=None, imagined=None))

@@ -30,15 +30,15 @@ class Entry(NamedTuple):
     format: int
 
 
-_PS_MBPO = Entry(PsMbpoSettings, "vecpsmbpo.algorithms.ps_mbpo.algorithm:PsMbpo", format=2)
+_PS_MBPO = Entry(PsMbpoSettings, "vecpsmbpo.algorithms.ps_mbpo.algorithm:PsMbpo", format=3)
 
 TABLE = {
     "ops_mbpo": _PS_MBPO,
     "ps_mbpo": _PS_MBPO,
     "mbpo": _PS_MBPO,
     "sac": _PS_MBPO,
-    "pets": Entry(PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=3),
-    "slbo": Entry(SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo", format=3),
+    "pets": Entry(PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=4),
+    "slbo": Entry(SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo", format=4),
 }
 
 

@@ -84,10 +84,14 @@ class Algorithm(ABC):
         """Whether there is anything to refresh for in the period that begins, [] bool."""
         return jnp.bool_(True)
 
+    def note_start(self, state: SeedState, obs: jax.Array) -> SeedState:
+        """Keeps what the algorithm wants of the observation [O] that a step of the running episode begins with."""
+        return state
+
     @property
     def ring_capacity(self) -> int:
-        """C_M: rows that are imagined for a member and kept."""
-        return 1
+        """C_M: rows that are imagined for a member and kept; 0 where none are."""
+        return 0
 
     def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Any:
         """The agents after what is learned at every step."""
@@ -102,6 +106,7 @@ class Algorithm(ABC):
         members = posterior.init(settings.n_members)
         size = spec.obs_size + spec.action_size
         ring = replay.init(self.ring_capacity, spec.obs_size, spec.action_size)
+        rings = jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape))
         return SeedState(
             key=key,
             hyper=hyper,
@@ -110,14 +115,13 @@ class Algorithm(ABC):
             ),
             agents=jax.vmap(self.init_agent)(layout.keys(agent_key, layout.member_ids())),
             real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
-            newest=ring[0],
-            imagined=jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape)),
+            newest=jnp.zeros(ring.shape[1:]),
+            imagined=rings if self.ring_capacity else None,
             moments=_no_moments(size, spec.obs_size),
             posterior=members,
             episode=self._begin_episode(members, None, hyper, jnp.int32(1), jnp.int32(1), jnp.bool_(True), draw_key),
-            starts=None,
             memory=self.memory(),
-            bandit=None,
+            own=(),
             epoch_return=jnp.zeros(()),
             epoch_episodes=jnp.zeros(()),
             epoch_unsound=jnp.zeros(()),
@@ -172,9 +176,8 @@ class Algorithm(ABC):
         random = counters.env_steps + 1 < self.settings.warmup_steps
         index, warmups = episode.index + 1, episode.warmups + random
         stored = self._unpack(row)
-        start = jnp.where(jnp.isfinite(transition.obs), transition.obs, stored.obs)
-        starts = posterior.add_start(state.starts, episode, start)
-        values = self.values(state.replace(starts=starts))
+        state = self.note_start(state, jnp.where(jnp.isfinite(transition.obs), transition.obs, stored.obs))
+        values = self.values(state)
         following = self._begin_episode(state.posterior, values, state.hyper, index, warmups, random, key)
         running = episode.replace(episode_return=total, length=length)
         state = state.replace(
@@ -182,7 +185,6 @@ class Algorithm(ABC):
             newest=row,
             moments=_welford(state.moments, stored, counters.env_steps),
             episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
-            starts=starts,
             memory=jax.tree.map(partial(jnp.where, done), self.memory(), state.memory),
             epoch_return=state.epoch_return + jnp.where(done, total, 0.0),
             epoch_episodes=state.epoch_episodes + done,

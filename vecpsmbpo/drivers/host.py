@@ -106,9 +106,8 @@ class HostDriver:
                     ends.append(end)
             except SimulatorError as error:
                 # Rows that were written to the rings lie beyond the counters, and will be written again.
-                rings = {"real": state.seeds.real, "imagined": state.seeds.imagined}
                 step = int(before.counters.env_steps) + len(ends) + 1
-                whole = before.replace(seeds=before.seeds.replace(**rings))
+                whole = before.replace(seeds=before.seeds.replace(**state.seeds.rings()))
                 raise Interrupted(step, whole, _stacked(news), error) from error
             state, frozen = self._settle(before, state)
             news += [end.replace(done=end.done & ~np.asarray(frozen)) for end in ends]

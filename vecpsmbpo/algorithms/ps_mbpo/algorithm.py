@@ -10,12 +10,25 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from vecpsmbpo import health, imagination, mixture, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
 from vecpsmbpo.sac import Agent
-from vecpsmbpo.types import Counters, Hyper, Params, Posterior, SeedState, Transition
+from vecpsmbpo.types import Bandit, Counters, Hyper, Params, Posterior, SeedState, Transition
+
+
+class Evidence(struct.PyTreeNode):
+    """What choices are made by, besides the returns of members; None where it is not asked for.
+
+    Attributes:
+        starts: [K, O], the first observations of the last K episodes (`weights=values`).
+        bandit: which chooses λ (`real_ratio_schedule=bandit`).
+    """
+
+    starts: jax.Array | None
+    bandit: Bandit | None
 
 
 class PsMbpo(Algorithm):
@@ -45,8 +58,10 @@ class PsMbpo(Algorithm):
         if settings.weighs_values:
             unknown = jnp.zeros(settings.n_members)  # no episode has begun yet
             starts = jnp.zeros((posterior.STARTS, self.spec.obs_size))
-            state = state.replace(starts=starts, episode=state.episode.replace(values=unknown))
-        return state.replace(bandit=mixture.init(settings) if settings.adapts_real_ratio else None)
+            state = state.replace(episode=state.episode.replace(values=unknown))
+        else:
+            starts = None
+        return state.replace(own=Evidence(starts, mixture.init(settings) if settings.adapts_real_ratio else None))
 
     # ── who acts: once an episode ────────────────────────────────────────────────────────────────────────────
 
@@ -57,12 +72,17 @@ class PsMbpo(Algorithm):
 
     def credit(self, state: SeedState, episode_return: jax.Array, counts: jax.Array) -> SeedState:
         """To the member (equation 19) and, where λ is chosen online, to the λ that it learned with."""
-        bandit = state.bandit
+        bandit = state.own.bandit
         if bandit is not None:
             arm = mixture.arms_of_members(self.settings, bandit)[state.episode.member]
             credited = mixture.credit(bandit, arm, episode_return)
-            state = state.replace(bandit=jax.tree.map(partial(jnp.where, counts), credited, bandit))
+            known = jax.tree.map(partial(jnp.where, counts), credited, bandit)
+            state = state.replace(own=state.own.replace(bandit=known))
         return super().credit(state, episode_return, counts)
+
+    def note_start(self, state: SeedState, obs: jax.Array) -> SeedState:
+        starts = posterior.add_start(state.own.starts, state.episode, obs)
+        return state.replace(own=state.own.replace(starts=starts))
 
     # ── act ──────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -106,7 +126,7 @@ class PsMbpo(Algorithm):
         since all are asked about the same states, the real starts, and since none may promise more or less than the
         rewards seen so far allow: a critic that runs away is not preferred for it.
         """
-        starts, moments = state.starts, state.moments
+        starts, moments = state.own.starts, state.moments
         if starts is None:
             return None
         nets = self.nets
@@ -149,7 +169,7 @@ class PsMbpo(Algorithm):
 
     def real_ratios(self, counters: Counters, state: SeedState) -> jax.Array:
         """[N·M] the λ of each member now."""
-        return mixture.real_ratios(self.settings, state.hyper, state.bandit, counters.env_steps)
+        return mixture.real_ratios(self.settings, state.hyper, state.own.bandit, counters.env_steps)
 
     def refreshes(self, counters: Counters, state: SeedState) -> jax.Array:
         """Whether any member may learn from imagined data, [] bool, in the period that begins: λ may fall from 1 within
