@@ -16,7 +16,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import type_handlers
 
-from vecpsmbpo import placement, recorded
+from vecpsmbpo import placement, processes, recorded
 from vecpsmbpo.algorithms import TABLE
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import SettingError, Settings
@@ -58,9 +58,15 @@ class Checkpoints:
         self._damaged: list[int] = []
         for name in ("absl", "orbax", "asyncio"):  # which tell of every file that cannot be read, beside the error
             logging.getLogger(name).setLevel(logging.CRITICAL)
+        read_only = read_only or not processes.is_first()
+        several = jax.process_count() > 1
+        if several and not read_only:
+            directory.mkdir(exist_ok=True)  # which orbax does for one process only
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep,
+            create=not several,
             enable_async_checkpointing=False,
+            multiprocessing_options=_alone(),
             cleanup_tmp_directories=not read_only,  # of a save that was killed
             read_only=read_only,
         )
@@ -81,13 +87,16 @@ class Checkpoints:
         return sorted(self._manager.all_steps())
 
     def save(self, step: int, state: TrainState, host: dict[str, Any], layout: Layout) -> None:
-        """Saves the train state, and what the host knows beside it in JSON's types.
+        """Saves the train state, and what the host knows beside it in JSON's types. All processes of a run call it, and
+        the first one writes.
 
         Checkpoints that `restore` found damaged make room first: the run has gone on from an older one.
         """
         while self._damaged:
             self._manager.delete(self._damaged.pop())
         plain = _to_host(state, layout)
+        if not processes.is_first():
+            return
         chunks = jax.tree.map(lambda _: ocp.SaveArgs(chunk_byte_size=CHUNK_BYTES), plain)
         about = {
             "format": self._format,
@@ -157,6 +166,14 @@ class Checkpoints:
         self._manager.close()
 
 
+def _alone() -> Any:
+    """Where there are several processes: what one of them reads or writes is no business of the others."""
+    index = jax.process_index()
+    if jax.process_count() == 1:
+        return ocp.options.MultiprocessingOptions()
+    return ocp.options.MultiprocessingOptions(index, {index}, barrier_sync_key_prefix=f"process{index}")
+
+
 def _sum(host: dict[str, Any]) -> int:
     return zlib.crc32(json.dumps(host, sort_keys=True).encode())
 
@@ -172,7 +189,9 @@ def _arrays_sum(plain: dict[str, Any]) -> int:
 
 
 def _to_host(state: TrainState, layout: Layout) -> dict[str, Any]:
-    rest = jax.tree.map(lambda x: np.asarray(_storable(x)), placement.unpad(layout, state.without_rings()))
+    """All processes of a run call it; it is the same in each."""
+    unpadded = placement.unpad(layout, processes.here(state.without_rings()))
+    rest = jax.tree.map(lambda x: np.asarray(_storable(x)), unpadded)
     rings = {name: placement.rings_to_host(layout, ring) for name, ring in state.seeds.rings().items()}
     return {"rest": rest, **rings}
 

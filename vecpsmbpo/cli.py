@@ -125,17 +125,18 @@ def _nothing_to_save() -> Iterator[None]:
 def _run(settings: Settings) -> int:
     with _nothing_to_save():
         from vecpsmbpo import runtime
+        from vecpsmbpo.processes import LostProcess
         from vecpsmbpo.training import DiskError, train
 
         runtime.check_flags()
     try:
         return train(settings)
-    except DiskError as error:
+    except (DiskError, LostProcess) as error:
         print(f"vecpsmbpo: {error}", file=sys.stderr, flush=True)
         # Not a plain exit: the writer threads of orbax and tensorboardX would each report the same disk again, in
-        # tracebacks of their own, while the interpreter ends.
+        # tracebacks of their own, while the interpreter ends; and JAX would wait for the process that is lost.
         crash.end()
-        os._exit(2)
+        os._exit(2 if isinstance(error, DiskError) else 1)
 
 
 class _Task:

@@ -221,9 +221,10 @@ def _default_run_dir(settings: Settings, overrides: Sequence[str]) -> str:
 
 
 def save(settings: Settings, run_dir: Path) -> None:
-    """Writes `config.yaml`."""
+    """Writes `config.yaml`: not with whom it was run, which is over when it ends."""
     beside = run_dir / f"{CONFIG_FILE}.tmp"
-    beside.write_text(yaml.safe_dump(recorded.plain(settings), sort_keys=False))
+    plain = recorded.plain(dataclasses.replace(settings, distributed=""))
+    beside.write_text(yaml.safe_dump(plain, sort_keys=False))
     beside.replace(run_dir / CONFIG_FILE)  # at once: a run whose config is cut short could not be resumed
 
 

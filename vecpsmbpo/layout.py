@@ -19,6 +19,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from vecpsmbpo import processes
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import SeedState, TrainState
 
@@ -63,6 +64,7 @@ class Layout:
         copies = partial(_copies, settings.n_members, settings.minibatch if on_cpu else 1)
         shape = _mesh_shape(len(settings.lanes), settings.n_models, settings.n_members, most, copies)
         grid = np.array(devices[: math.prod(shape)]).reshape(shape)
+        processes.check_all_have_one_of(grid)
         return cls(
             mesh=Mesh(grid, (SEEDS, MEMBERS)),
             num_seeds=len(settings.lanes),
@@ -221,6 +223,10 @@ class Layout:
         body = jax.shard_map(body, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
         # Shardings are stated, not inferred, so that a fresh and a resumed run are one program to the cache.
         return jax.jit(body, in_shardings=self._placed(in_specs), out_shardings=self._placed(out_specs), **jit)
+
+    def everywhere(self, tree: Any, spec: PartitionSpec) -> Any:
+        """What every process of the run has, as arguments of `jit_shard_map`: all leaves lie as `spec` says."""
+        return processes.everywhere(tree, jax.tree.map(lambda _: NamedSharding(self.mesh, spec), tree))
 
     def _placed(self, specs: Any) -> Any:
         return jax.tree.map(

@@ -84,6 +84,20 @@ class RunLog:
         self._loggers.close()
 
 
+class NoLog:
+    """Of a process that does not write: as `RunLog`."""
+
+    marks: Mapping[str, Any] = MappingProxyType({})
+
+    def session(self, line: Line) -> None: ...
+
+    def episodes(self, lines: Iterable[Line]) -> None: ...
+
+    def metrics(self, lines: Iterable[Line]) -> None: ...
+
+    def close(self) -> None: ...
+
+
 def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[Line]:
     """The episodes that finished in a chunk.
 

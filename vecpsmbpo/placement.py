@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
+from vecpsmbpo import processes
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.types import TrainState
 
@@ -25,7 +26,8 @@ def place(layout: Layout, state: TrainState) -> TrainState:
     # Padding repeats what there is: any valid numbers do.
     models = np.arange(layout.padded_models) % layout.n_models
     padded = _rearranged(state, models, layout.members_at_places() % layout.n_members)
-    return jax.device_put(padded, layout.shardings(padded))
+    shardings = layout.shardings(padded)
+    return jax.device_put(processes.everywhere(padded, shardings), shardings)
 
 
 def _rearranged(state: TrainState, models: np.ndarray, members: np.ndarray) -> TrainState:
@@ -50,12 +52,15 @@ def _rearranged(state: TrainState, models: np.ndarray, members: np.ndarray) -> T
 def rings_to_host(layout: Layout, rings: jax.Array) -> list[np.ndarray]:
     """Each ring [C, F] of [S, C, F], or of the N·M members in [S, P, C, F], by itself.
 
-    Views, where the host's memory is the device's.
+    Views, where the host's memory is the device's; copies, where other processes have some of the devices.
     """
     by_place: dict[tuple[int, ...], np.ndarray] = {}
-    for shard in rings.addressable_shards:
-        part = _view(shard.data)
-        where: Any = shard.index
+    if rings.is_fully_addressable:
+        parts = [(_view(shard.data), shard.index) for shard in rings.addressable_shards]
+    else:
+        parts = [(processes.here(rings), (slice(None),) * rings.ndim)]
+    for part, index in parts:
+        where: Any = index
         for inside, place in zip(np.ndindex(part.shape[:-2]), _places(where[:-2], rings.shape), strict=True):
             by_place[place] = part[inside]
     members = [layout.places_of_members.tolist()] if rings.ndim == 4 else []

@@ -47,9 +47,9 @@ def working_bytes(algorithm: Algorithm) -> int:
 
 
 def available_bytes(layout: Layout) -> int:
-    """Free memory for the mesh: of the GPUs, or of this machine (and its control group)."""
+    """Free memory for this process's part of the mesh: of the GPUs, or of this machine (and its control group)."""
     if not _on_cpu(layout):
-        stats = [device.memory_stats() or {} for device in layout.mesh.devices.ravel()]
+        stats = [device.memory_stats() or {} for device in layout.mesh.local_devices]
         return sum(s.get("bytes_limit", 0) - s.get("bytes_in_use", 0) for s in stats)
     return min(_machine_available(), _control_group_available())
 
@@ -88,8 +88,9 @@ def check_memory(algorithm: Algorithm, shapes: Any) -> str:
         SettingError: it does not fit.
     """
     layout = algorithm.layout
-    state, working = state_bytes(layout, shapes), working_bytes(algorithm)
-    working += state_bytes(layout, shapes.without_rings())  # as a stride began, should it have to be undone
+    ours = len(layout.mesh.local_devices) / layout.mesh.size  # of several processes, each has its own memory
+    state, working = ours * state_bytes(layout, shapes), ours * working_bytes(algorithm)
+    working += ours * state_bytes(layout, shapes.without_rings())  # as a stride began, should it have to be undone
     program = PROGRAM_BYTES if _on_cpu(layout) else 0
     free = available_bytes(layout)
     words = f"{state / GIB:.2f} GiB of buffers and networks, {working / GIB:.2f} GiB at work"

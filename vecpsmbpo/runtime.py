@@ -8,14 +8,14 @@ from pathlib import Path
 
 import jax
 
-from vecpsmbpo import words
+from vecpsmbpo import processes, words
 from vecpsmbpo.settings import SettingError, Settings
 
 SINGLE_THREADED = "--xla_cpu_multi_thread_eigen=false"
 
 
 def configure(settings: Settings) -> None:
-    """One CPU device per core, and the compilation cache.
+    """One CPU device per core, the other processes of the run, and the compilation cache.
 
     Each CPU device computes on one thread: members spread over devices use the cores better than threads inside small
     matrix products do, and results do not depend on the scheduling of threads. How many of them a run uses is decided
@@ -23,7 +23,8 @@ def configure(settings: Settings) -> None:
     a GPU.
 
     Raises:
-        SettingError: JAX finds no device, or not the one that JAX_PLATFORMS asks for.
+        SettingError: JAX finds no device, or not the one that JAX_PLATFORMS asks for, or the other processes are not
+            there.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     flags = os.environ.get("XLA_FLAGS", "")
@@ -34,6 +35,7 @@ def configure(settings: Settings) -> None:
             jax.config.update("jax_num_cpu_devices", cores)
         except RuntimeError:  # a backend is there already: an earlier job's, or of a program that imports this package
             logging.getLogger(__name__).debug("JAX is already initialised; its devices are used as they are")
+    processes.join(settings.distributed)
     jax.config.update("jax_enable_compilation_cache", settings.compile_cache)
     if settings.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(cache_dir()))

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import health
+from vecpsmbpo import health, processes
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers.common import (
     BY_SEED,
@@ -67,7 +67,7 @@ class HostDriver:
         self._saved_env: dict[str, Any] | None = None  # as the running stride began
 
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
-        return self._init(keys, hyper, jnp.asarray(self._env.reset()))
+        return self._init(*self.layout.everywhere((keys, hyper, jnp.asarray(self._env.reset())), BY_SEED))
 
     def shapes(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         return jax.eval_shape(self._init, keys, hyper, self._shape(self.algorithm.spec.obs_size))
@@ -110,37 +110,40 @@ class HostDriver:
                 whole = before.replace(seeds=before.seeds.replace(**state.seeds.rings()))
                 raise Interrupted(step, whole, _stacked(news), error) from error
             state, frozen = self._settle(before, state)
-            news += [end.replace(done=end.done & ~np.asarray(frozen)) for end in ends]
+            news += [end.replace(done=end.done & ~np.asarray(processes.here(frozen))) for end in ends]
         self._saved_env = None
         return state, _stacked(news)
 
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
         obs = state.env
         action, memory, key, keys = self._act(state.counters, state.seeds, obs)
-        step = self._env.step(np.asarray(action))
-        terminated = step.terminated.astype(np.float32)
-        transition = Transition(*map(jnp.asarray, (obs, action, step.reward, step.next_obs, terminated)))
-        state, end = self._observe(state, memory, transition, step.truncated, key, keys, step.obs, learning)
-        return state, jax.tree.map(np.asarray, end)
+        step = self._env.step(np.asarray(processes.here(action)))
+        seen = (step.reward, step.next_obs, step.terminated.astype(np.float32), step.truncated, step.obs)
+        reward, next_obs, terminated, truncated, following = self.layout.everywhere(seen, BY_SEED)
+        transition = Transition(obs, action, reward, next_obs, terminated)
+        state, end = self._observe(state, memory, transition, truncated, key, keys, following, learning)
+        return state, jax.tree.map(np.asarray, processes.here(end))
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
         seeds, obs_size = self.layout.num_seeds, self.algorithm.spec.obs_size
         split = split_for_episodes(keys, episodes)
-        policies = self._policies(state.seeds, split.policy)
         env_seed = int(jax.random.randint(split.resets[0, 0], (), 0, 2**30))
+        split = self.layout.everywhere(split, BY_SEED)
+        policies = self._policies(state.seeds, split.policy)
         env = self._make_env(num_envs=seeds * episodes, seed=env_seed)
         env.episode_length = self.settings.episode_length
         obs = env.reset()
         compiled_for = self._compiled_evaluation_actions if episodes == self.settings.eval_episodes else None
         act, count = compiled_for or self._evaluation_actions, seeds * episodes
-        memory = broadcast_leaves(self.algorithm.memory(), seeds, episodes)
+        memory = self.layout.everywhere(broadcast_leaves(self.algorithm.memory(), seeds, episodes), BY_SEED)
         total, length, alive = np.zeros(count), np.zeros(count, int), np.ones(count, bool)
         for t in itertools.count():
             if not alive.any():
                 break
-            states = obs.reshape(seeds, episodes, obs_size)
-            action, memory = act(policies, jnp.int32(t), memory, states, split.actions)
-            step = env.step(np.asarray(action).reshape(count, -1))
+            states = self.layout.everywhere(obs.reshape(seeds, episodes, obs_size), BY_SEED)
+            now = self.layout.everywhere(jnp.int32(t), SHARED)
+            action, memory = act(policies, now, memory, states, split.actions)
+            step = env.step(np.asarray(processes.here(action)).reshape(count, -1))
             obs = step.obs
             total += np.where(alive & step.sound, step.reward, 0.0)
             length += alive

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from vecpsmbpo import health
+from vecpsmbpo import health, processes
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers.common import (
     BY_SEED,
@@ -46,7 +46,7 @@ class ScanDriver:
         self._compiled_evaluate: Any = None
 
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
-        return self._init(keys, hyper)
+        return self._init(*self.layout.everywhere((keys, hyper), BY_SEED))
 
     def shapes(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         return jax.eval_shape(self._init, keys, hyper)
@@ -57,13 +57,14 @@ class ScanDriver:
         (self._compiled, self._compiled_evaluate), self.compile_seconds = compiled(programs)
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
-        state, log = (self._compiled or self._run)(state, jnp.int32(strides))
-        flat = jax.tree.map(lambda x: np.asarray(x)[:strides].reshape(-1, *x.shape[2:]), log)
+        state, log = (self._compiled or self._run)(state, self.layout.everywhere(jnp.int32(strides), SHARED))
+        flat = jax.tree.map(lambda x: np.asarray(x)[:strides].reshape(-1, *x.shape[2:]), processes.here(log))
         return state, flat
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
         program = self._compiled_evaluate if episodes == self.settings.eval_episodes else None
-        return Returns(*map(np.asarray, (program or self._evaluate)(state.seeds, split_for_episodes(keys, episodes))))
+        split = self.layout.everywhere(split_for_episodes(keys, episodes), BY_SEED)
+        return Returns(*map(np.asarray, processes.here((program or self._evaluate)(state.seeds, split))))
 
     def save_env(self) -> dict[str, Any]:
         return {}  # the environments are part of the train state

@@ -15,7 +15,7 @@ Sweep = tuple[tuple[str, tuple[float, ...]], ...]  # name and values of each `sw
 # Settings that a resumed run may change: they steer the loop around the run, not what it computes.
 CHANGEABLE = frozenset(
     {"total_steps", "eval_episodes", "eval_policy", "eval_actions", "checkpoint_every", "report", "devices"}
-    | {"keep_checkpoints", "loggers", "compile_cache"}
+    | {"distributed", "keep_checkpoints", "loggers", "compile_cache"}
 )
 
 MOST_LANES = 10_000
@@ -48,6 +48,7 @@ class Settings:
     report: bool
     loggers: tuple[str, ...] = choice("tensorboard", "wandb", "mlflow")
     devices: int = whole(0)
+    distributed: str
     compile_cache: bool
     network_precision: str = choice("default", "float32", "bfloat16")
     # real data

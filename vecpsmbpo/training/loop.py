@@ -9,8 +9,21 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from rich.console import Console
 
-from vecpsmbpo import checkpoint, config, crash, health, jsonl, metrics, placement, resources, runtime, versions
+from vecpsmbpo import (
+    checkpoint,
+    config,
+    crash,
+    health,
+    jsonl,
+    metrics,
+    placement,
+    processes,
+    resources,
+    runtime,
+    versions,
+)
 from vecpsmbpo.drivers import Driver, Interrupted, Returns
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.look import report
@@ -38,6 +51,7 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
         SettingError: it cannot be run as asked (`resources.check_memory`, `envs.make`), or not be gone on with. Nothing
             has been changed then.
         DiskError: the run directory cannot be written.
+        LostProcess: another process of the run is gone.
     """
     runtime.configure(settings)
     driver = make_driver(settings)
@@ -47,7 +61,8 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
     with disk_errors(run_dir):
         run_dir.mkdir(parents=True, exist_ok=True)
         heeded = heeding_signals() if stop is None else contextlib.nullcontext(stop)
-        with alone_in(run_dir), heeded as stop:
+        alone = alone_in(run_dir) if processes.is_first() else contextlib.nullcontext()
+        with alone, heeded as stop:
             _check_not_emptied(run_dir)
             crash.doing("making the first state", run_dir)
             return _Session(settings, driver, shapes, memory).go(stop)
@@ -64,17 +79,26 @@ class _Session:
         saved = self.checkpoints.restore(shapes, driver.layout, warn=_warn)
         if saved and saved.step > settings.total_steps:
             raise SettingError(f"total_steps={settings.total_steps}: the run has already done {saved.step}")
-        config.save(settings, self.run_dir)  # now that it is known to be the run's own
+        if processes.of_first(saved.step if saved else 0) != (saved.step if saved else 0):
+            raise SettingError(f"run_dir={self.run_dir}: processes find different checkpoints in it; it must be shared")
+        if processes.is_first():
+            config.save(settings, self.run_dir)  # now that it is known to be the run's own
         self.state = saved.state if saved else driver.init(*initial_inputs(settings))
         self.saved_step = saved.step if saved else None
         self.watch = Stopwatch(saved.host["seconds"] if saved else 0.0)
         if saved:
             driver.load_env(saved.host["env"])
         self.env_steps = saved.step if saved else 0
-        self.frozen = np.asarray(health.frozen(self.state.seeds.health))
-        marks = saved.host.get("logs", {}) if saved else {}
-        self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn, marks)
-        self.display = Display(driver.algorithm, self.env_steps)
+        self.health = processes.here(self.state.seeds.health)
+        self.frozen = np.asarray(health.frozen(self.health))
+        self.log: metrics.RunLog | metrics.NoLog
+        if processes.is_first():
+            marks = saved.host.get("logs", {}) if saved else {}
+            self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn, marks)
+            self.display = Display(driver.algorithm, self.env_steps)
+        else:
+            self.log = metrics.NoLog()
+            self.display = Display(driver.algorithm, self.env_steps, Console(quiet=True))
         self.memory = memory
         self.epoch_began = time.perf_counter()
         self.epoch_steps_done = 0
@@ -97,20 +121,33 @@ class _Session:
                 if self.saved_step is None:
                     self._save()
                 self._compile()
-                while self.env_steps < settings.total_steps and not stop.requested and not self.frozen.all():
+                while self.env_steps < settings.total_steps and not self.frozen.all() and not self._asked_to(stop):
                     self._chunk()
-                    if stop.save:
-                        stop.save = False
-                        self._save()
                 self._save()
                 return self._farewell(stop)
         except Interrupted as error:
             return self._failed(f"at step {error.step}", error)
         except SimulatorError as error:
             return self._failed(f"in the evaluation at step {self.env_steps}", error)
+        except jax.errors.JaxRuntimeError as error:
+            if jax.process_count() == 1:
+                raise
+            why = str(error).strip().splitlines()[0][:200]
+            saved = f"saved at step {self.saved_step}; to continue, in all of them: {self._to_continue}"
+            raise processes.LostProcess(f"another process of the run is gone ({why}); {saved}") from None
         finally:
             self.log.close()
             self.checkpoints.close()
+
+    def _asked_to(self, stop: Stop) -> bool:
+        """Whether signals have asked any process to stop; saves first, if it is that which they asked for."""
+        if processes.greatest(int(stop.save)):
+            stop.save = False
+            self._save()
+        asked = processes.greatest(stop.requested or 0)
+        if asked:  # only then: a signal may come at any time, this line included
+            stop.requested = asked
+        return bool(asked)
 
     def _devices(self) -> list[str]:
         """What those are that the run uses: `cpu`, `NVIDIA H100 80GB HBM3`."""
@@ -145,7 +182,7 @@ class _Session:
         into_epoch = self.env_steps % settings.epoch_steps
         if into_epoch == 0:
             self.epoch_began, self.epoch_steps_done = time.perf_counter(), 0
-        strides = self._strides(settings.epoch_steps - into_epoch)
+        strides = processes.of_first(self._strides(settings.epoch_steps - into_epoch))
         began = time.perf_counter()
         news: EpisodeEnd | None
         failed: Interrupted | None = None
@@ -192,7 +229,8 @@ class _Session:
         epoch = self.env_steps // settings.epoch_steps
         if epoch % settings.checkpoint_every == 0 and self.env_steps < settings.total_steps:
             self._save()
-        if settings.report and (epoch % settings.checkpoint_every == 0 or self.env_steps >= settings.total_steps):
+        shown = epoch % settings.checkpoint_every == 0 or self.env_steps >= settings.total_steps
+        if settings.report and shown and processes.is_first():
             report.keep(self.run_dir, _warn)
 
     def _lines(self, returns: Returns, seconds: float) -> list[metrics.Line]:
@@ -212,11 +250,13 @@ class _Session:
         ]
 
     def _epoch_lines(self) -> list[metrics.Line]:
-        return metrics.epoch_lines(placement.unpad(self.driver.layout, self.state.without_rings()), self.settings)
+        state = processes.here(self.state.without_rings())
+        return metrics.epoch_lines(placement.unpad(self.driver.layout, state), self.settings)
 
     def _note_frozen(self) -> None:
         """Says and writes which lanes were frozen in the chunk that ended."""
-        before, self.frozen = self.frozen, np.asarray(health.frozen(self.state.seeds.health))
+        self.health = processes.here(self.state.seeds.health)
+        before, self.frozen = self.frozen, np.asarray(health.frozen(self.health))
         new = np.flatnonzero(self.frozen & ~before).tolist()
         if new:
             lines = self._epoch_lines()
@@ -231,19 +271,22 @@ class _Session:
         return {
             **line,
             **dict.fromkeys(unknown),
-            "env_steps": int(self.state.seeds.health.env_steps[lane]),
+            "env_steps": int(self.health.env_steps[lane]),
             "compile_seconds": self.driver.compile_seconds,
             "seconds": self.watch(),
             "frozen": True,
-            "not_finite": health.describe(self.state.seeds, lane, self.settings),
+            "not_finite": self._what_froze(lane),
         }
 
     def _frozen_words(self, lane: int) -> str:
         name = ", ".join(f"{name} {value:g}" for name, value in self.settings.lanes[lane].items())
-        step = int(self.state.seeds.health.env_steps[lane])
-        what = health.describe(self.state.seeds, lane, self.settings)
+        step = int(self.health.env_steps[lane])
         good = step - self.settings.stride
+        what = self._what_froze(lane)
         return f"{name} is frozen as it was at step {good}: {what} stopped being finite by step {step}"
+
+    def _what_froze(self, lane: int) -> str:
+        return health.describe(self.state.seeds.replace(health=self.health), lane, self.settings)
 
     def _name_unsound(self, lines: list[metrics.Line]) -> None:
         """Names a task whose simulator returned NaN or infinity in the epoch that `lines` are of: also where it was
