@@ -43,11 +43,8 @@ def end(running):
 
 def alone(devices, cwd, *words):
     flags = {**environment(), "XLA_FLAGS": DEVICES.format(devices)}
-    done = subprocess.run(
-        argv(*RUN, *words), cwd=cwd, env=flags, capture_output=True, text=True, timeout=500, check=False
-    )
+    done = subprocess.run(argv(*RUN, *words), cwd=cwd, env=flags, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def arrays(run_dir, step):
@@ -75,7 +72,7 @@ def test_several_processes_are_one_with_as_many_devices(count, task, tmp_path):
     several, one = tmp_path / "several", tmp_path / "alone"
     assert arrays(several, 120) == arrays(one, 120)
     for name in (jsonl.METRICS_FILE, jsonl.EPISODES_FILE):
-        assert without_times(several / name) == without_times(one / name)
+        assert without_times(jsonl.read(several / name)) == without_times(jsonl.read(one / name))
     assert "distributed: ''" in (several / "config.yaml").read_text()
 
 
@@ -109,9 +106,7 @@ def test_a_process_that_dies_ends_the_run_and_a_signal_to_one_stops_all(tmp_path
     assert "to continue" in ended[0][1]
 
 
-@pytest.mark.parametrize(
-    "wrong", ["maybe", "host/0/2", "host:12/2/2", ":12/0/1", "host:12/0", "host:12/0/2/3", "a:1/x/2"]
-)
+@pytest.mark.parametrize("wrong", ["maybe", "a/0/2", "a:12/2/2", ":12/0/1", "a:12/0", "a:12/0/2/3", "a:1/x/2"])
 def test_an_address_that_is_none(wrong):
     with pytest.raises(SettingError, match=r"^distributed=.*: must be auto, or host:port/index/processes"):
         processes.join(wrong)
