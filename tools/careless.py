@@ -29,6 +29,7 @@ SETTINGS = [
         "seed='",
     ),
     *("experiment=fig2", "hydra.nosuch=1", "env=hopper env.id=x", "n_models=1,2", "validation_ratio=0.3", "devices=-1"),
+    *("distributed=maybe", "distributed=a:1/2/2"),
 ]
 
 MODULES = {
