@@ -12,6 +12,7 @@ MuJoCo; each fits its models until they stop to improve. Evaluation does not cou
 """
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -44,6 +45,7 @@ def compare(words: Sequence[str]) -> dict[str, Any]:
         ours.append(time_here())
     best_here, best_there = min(ours), min(found["ms_per_step"] for found in theirs)
     return {
+        "cpus": os.cpu_count(),
         "task": "hopper",
         **SAME,
         "ours_ms_per_step": ours,
