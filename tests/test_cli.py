@@ -116,6 +116,7 @@ def answers(tmp_path_factory):
         timeout=300,
         check=True,
     )
+    assert result.stderr == ""  # of native code and the watcher, too
     return [json.loads(line) for line in result.stdout.splitlines()]
 
 

@@ -1,7 +1,6 @@
 """One run over several processes, on this machine: the same as in one process with as many devices, to the bit."""
 
 import json
-import re
 import signal
 import socket
 import subprocess
@@ -11,28 +10,38 @@ import pytest
 
 from tests.helpers import argv, environment
 from tests.test_resume import without_times
-from vecpsmbpo import jsonl, processes
+from vecpsmbpo import cli, jsonl, processes
 from vecpsmbpo.settings import SettingError
 
 RUN = ("train", "size=tiny", "loggers=[]")
 DEVICES = "--xla_force_host_platform_device_count={} --xla_cpu_multi_thread_eigen=false"
 
 
-def start(count, cwd, *words):
-    """The processes of a run, one device each."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    where = {"cwd": cwd, "env": {**environment(), "XLA_FLAGS": DEVICES.format(1)}, "text": True}
-    return [
-        subprocess.Popen(
-            argv(*RUN, *words, f"distributed=127.0.0.1:{port}/{index}/{count}"),
-            **where,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        for index in range(count)
-    ]
+@pytest.fixture
+def start(tmp_path):
+    """Starts the processes of a run, with so many devices each; none outlives the test."""
+    started = []
+
+    def begin(count, *words, devices=1):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        where = {"cwd": tmp_path, "env": {**environment(), "XLA_FLAGS": DEVICES.format(devices)}, "text": True}
+        running = [
+            subprocess.Popen(
+                argv(*RUN, *words, f"distributed=127.0.0.1:{port}/{index}/{count}"),
+                **where,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+            )
+            for index in range(count)
+        ]
+        started.extend(running)
+        return running
+
+    yield begin
+    for process in started:
+        process.kill()
 
 
 def end(running):
@@ -53,22 +62,22 @@ def arrays(run_dir, step):
 
 
 @pytest.mark.parametrize(
-    ("count", "task"),
+    ("count", "devices", "task"),
     [
-        (2, ("env=ball_in_cup", "backend=host")),
-        pytest.param(4, ("env=cartpole_swingup", "num_seeds=2"), marks=pytest.mark.slow),
+        (2, 2, ("env=ball_in_cup", "backend=host", "num_seeds=2")),
+        pytest.param(4, 1, ("env=cartpole_swingup", "num_seeds=2"), marks=pytest.mark.slow),
     ],
     ids=["host", "mjx"],
 )
-def test_several_processes_are_one_with_as_many_devices(count, task, tmp_path):
+def test_several_processes_are_one_with_as_many_devices(count, devices, task, start, tmp_path):
     """Also where one goes on with what several have begun."""
-    ended = end(start(count, tmp_path, *task, "total_steps=80", "run_dir=several"))
+    ended = end(start(count, *task, "total_steps=80", "run_dir=several", devices=devices))
     assert [status for status, _, _ in ended] == [0] * count, ended
     said = [output for _, output, _ in ended]
-    assert f"on {count} cpu device(s)" in said[0]
+    assert f"on {count * devices} cpu device(s)" in said[0]
     assert said[1:] == [""] * (count - 1)  # the first one speaks
-    alone(count, tmp_path, *task, "total_steps=120", "run_dir=several")
-    alone(count, tmp_path, *task, "total_steps=120", "run_dir=alone")
+    alone(count * devices, tmp_path, *task, "total_steps=120", "run_dir=several")
+    alone(count * devices, tmp_path, *task, "total_steps=120", "run_dir=alone")
     several, one = tmp_path / "several", tmp_path / "alone"
     assert arrays(several, 120) == arrays(one, 120)
     for name in (jsonl.METRICS_FILE, jsonl.EPISODES_FILE):
@@ -76,34 +85,63 @@ def test_several_processes_are_one_with_as_many_devices(count, task, tmp_path):
     assert "distributed: ''" in (several / "config.yaml").read_text()
 
 
-def test_a_process_that_dies_ends_the_run_and_a_signal_to_one_stops_all(tmp_path):
-    words = ("env=ball_in_cup", "backend=host", "total_steps=1000000", "run_dir=run")
+LONG = ("env=ball_in_cup", "backend=host", "total_steps=1000000", "run_dir=run")
 
-    def begun():
-        running = start(2, tmp_path, *words)
+
+@pytest.fixture
+def begun(start, tmp_path):
+    """Starts a long run of two processes, or goes on with it, and waits for three epochs."""
+
+    def begin():
         epochs = tmp_path / "run" / jsonl.METRICS_FILE
         before = len(jsonl.read(epochs)) if epochs.exists() else 0
+        running = start(2, *LONG)
         deadline = time.monotonic() + 300
         while not epochs.exists() or len(jsonl.read(epochs)) < before + 3:
-            assert all(process.poll() is None for process in running), end(running)
+            assert all(process.poll() is None for process in running)
             assert time.monotonic() < deadline
             time.sleep(0.2)
         return running
 
-    running = begun()
-    running[1].kill()
-    (status, _, errors), _ = end(running)
-    told = [line for line in errors.splitlines() if line.startswith("vecpsmbpo: ")]
-    assert status == 1
-    assert len(told) == 1
-    assert re.search(r"another process of the run is gone .* saved at step \d+; to continue", told[0])
-    assert "Traceback" not in errors
+    return begin
+
+
+def test_where_one_is_gone_the_others_end_and_a_signal_to_one_stops_all(begun, tmp_path):
+    for lost, said in ((1, "another process of the run is gone"), (0, "another process of the run")):
+        running = begun()
+        running[lost].kill()
+        status, _, errors = end(running)[1 - lost]
+        told = [line for line in errors.splitlines() if line.startswith("vecpsmbpo: ")]
+        assert status != 0
+        assert len(told) == 1, errors
+        assert said in told[0]
+        assert "same command again" in told[0]
 
     running = begun()  # from the last checkpoint
     running[1].send_signal(signal.SIGTERM)
     ended = end(running)
-    assert [status for status, _, _ in ended] == [128 + signal.SIGTERM] * 2
-    assert "to continue" in ended[0][1]
+    assert [status for status, _, _ in ended] == [128 + signal.SIGTERM] * 2, ended
+    assert "to continue: the same command again" in ended[0][1]
+    steps = max(int(path.name) for path in (tmp_path / "run" / "checkpoints").iterdir())
+    assert jsonl.read(tmp_path / "run" / jsonl.EPISODES_FILE)[-1]["env_steps"] <= steps
+
+
+def test_what_fails_in_one_fails_in_all(start, tmp_path):
+    """Two runs in one directory, and processes that were not started alike: one line in each."""
+    first = start(1, *LONG)
+    while not (tmp_path / "run" / "config.yaml").exists():
+        assert first[0].poll() is None
+        time.sleep(0.2)
+    ended = end(start(2, *LONG))
+    assert [status for status, _, _ in ended] == [2, 1], ended
+    assert "vecpsmbpo: run_dir=run: another process is training in it" in ended[0][2]
+    assert "vecpsmbpo: another process of the run has failed" in ended[1][2]
+
+
+def test_a_grid_is_not_one_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["train", "-m", "seed=0,1", "distributed=auto"]) == 2
+    assert capsys.readouterr().err == "vecpsmbpo: distributed: is of a single run, and not of a grid (-m)\n"
 
 
 @pytest.mark.parametrize("wrong", ["maybe", "a/0/2", "a:12/2/2", ":12/0/1", "a:12/0", "a:12/0/2/3", "a:1/x/2"])

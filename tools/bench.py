@@ -7,6 +7,7 @@
     python tools/bench.py profile     where the time of an epoch and its evaluation goes (default: the quick start)
     python tools/bench.py envs        steps per second and compile seconds of every task, on each backend and batch size
     python tools/bench.py host        host simulators stepped in a loop, by threads and by processes
+    python tools/bench.py hosted      what a step around a host simulator costs besides simulating and learning
     python tools/bench.py compare     one policy of MBPO, here and in mbrl-lib (bench_peer.py says what it needs)
 
 Further arguments are settings, as for `vecpsmbpo train` (of `envs`: tasks). One line of JSON per measurement.
@@ -403,7 +404,35 @@ def bench_compare() -> dict[str, Any]:
         sys.exit(2)
 
 
+def bench_hosted() -> dict[str, Any]:
+    """Of a step around a simulator of the host what is neither the simulator nor learning: acting, observing, and the
+    way to the device and back."""
+    settings = config.compose(["env=hopper", "size=cpu", "warmup_steps=1000", *sys.argv[2:], "backend=host"])
+    runtime.configure(settings)
+    driver = make_driver(settings)
+    state = driver.init(*initial_inputs(settings))
+    driver.compile(state)
+    strides = settings.model_update_every // settings.stride
+    state, _ = driver.run(state, strides)
+    seconds = []
+    for _ in range(2):
+        began = time.perf_counter()
+        state, _ = driver.run(state, strides)
+        seconds.append((time.perf_counter() - began) / settings.model_update_every)
+    lanes = len(settings.lanes)
+    simulator = lanes / host_steps(settings.env, lanes)["steps_per_s"]
+    return {
+        "task": settings.env,
+        "seeds": lanes,
+        "members": settings.n_members,
+        "ms_per_step": 1e3 * min(seconds),
+        "ms_of_simulator": 1e3 * simulator,
+        "ms_around_it": 1e3 * (min(seconds) - simulator),
+    }
+
+
 BENCHES = {
+    "hosted": bench_hosted,
     "compare": bench_compare,
     "envs": bench_envs,
     "host": bench_host,

@@ -62,7 +62,7 @@ PARTS = (
 OPTIONS = {
     "out": arguments.out("where the figures go", "results/gpu"),
     "size": arguments.choice("of the programs that are run", "paper", "tiny"),
-    "minutes": arguments.number("all parts together", 30.0),
+    "minutes": arguments.number("all parts together", 30.0, above=0),
 }
 
 

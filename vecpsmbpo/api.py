@@ -168,6 +168,8 @@ def train(**settings: Any) -> Run:
         SettingError: a mistake in the settings, in one line.
         training.DiskError: the run directory cannot be written.
     """
+    if settings.get("distributed"):
+        raise SettingError("distributed: is for the command line, which a run of several processes has to itself")
     resolved = config.resolve(config.overrides_of(settings))
     run_training(resolved)
     return Run(resolved.run_dir)

@@ -68,14 +68,14 @@ def wholes(what: str) -> Option:
     )
 
 
-def number(what: str, default: float | None = None) -> Option:
+def number(what: str, default: float | None = None, above: float = -float("inf")) -> Option:
     def read(value: str) -> float:
         found = float(value)
-        if found != found or abs(found) == float("inf"):
+        if not above < found < float("inf"):
             raise ValueError
         return found
 
-    return Option(what, default, read, "a number")
+    return Option(what, default, read, "a number" if above == -float("inf") else f"a number above {above:g}")
 
 
 def out(what: str, default: str, *suffixes: str) -> Option:

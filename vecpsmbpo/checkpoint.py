@@ -59,7 +59,7 @@ class Checkpoints:
         for name in ("absl", "orbax", "asyncio"):  # which tell of every file that cannot be read, beside the error
             logging.getLogger(name).setLevel(logging.CRITICAL)
         read_only = read_only or not processes.is_first()
-        several = jax.process_count() > 1
+        several = processes.are_several()
         if several and not read_only:
             directory.mkdir(exist_ok=True)  # which orbax does for one process only
         options = ocp.CheckpointManagerOptions(
@@ -92,11 +92,14 @@ class Checkpoints:
 
         Checkpoints that `restore` found damaged make room first: the run has gone on from an older one.
         """
+        plain = _to_host(state, layout)
+        with processes.together():
+            if processes.is_first():
+                self._write(step, plain, host)
+
+    def _write(self, step: int, plain: dict[str, Any], host: dict[str, Any]) -> None:
         while self._damaged:
             self._manager.delete(self._damaged.pop())
-        plain = _to_host(state, layout)
-        if not processes.is_first():
-            return
         chunks = jax.tree.map(lambda _: ocp.SaveArgs(chunk_byte_size=CHUNK_BYTES), plain)
         about = {
             "format": self._format,
@@ -169,7 +172,7 @@ class Checkpoints:
 def _alone() -> Any:
     """Where there are several processes: what one of them reads or writes is no business of the others."""
     index = jax.process_index()
-    if jax.process_count() == 1:
+    if not processes.are_several():
         return ocp.options.MultiprocessingOptions()
     return ocp.options.MultiprocessingOptions(index, {index}, barrier_sync_key_prefix=f"process{index}")
 

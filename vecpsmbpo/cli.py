@@ -124,19 +124,20 @@ def _nothing_to_save() -> Iterator[None]:
 
 def _run(settings: Settings) -> int:
     with _nothing_to_save():
-        from vecpsmbpo import runtime
-        from vecpsmbpo.processes import LostProcess
+        from vecpsmbpo import processes, runtime
         from vecpsmbpo.training import DiskError, train
 
         runtime.check_flags()
     try:
         return train(settings)
-    except (DiskError, LostProcess) as error:
+    except (DiskError, processes.LostProcess, SettingError) as error:
+        if isinstance(error, SettingError) and not processes.are_several():
+            raise
         print(f"vecpsmbpo: {error}", file=sys.stderr, flush=True)
         # Not a plain exit: the writer threads of orbax and tensorboardX would each report the same disk again, in
-        # tracebacks of their own, while the interpreter ends; and JAX would wait for the process that is lost.
+        # tracebacks of their own, while the interpreter ends; and JAX would wait for the processes that have left.
         crash.end()
-        os._exit(2 if isinstance(error, DiskError) else 1)
+        os._exit(1 if isinstance(error, processes.LostProcess) else 2)
 
 
 class _Task:
@@ -178,7 +179,8 @@ def _multirun(overrides: list[str]) -> int:
     from vecpsmbpo.sweeps import launch
     from vecpsmbpo.sweeps.job import Elsewhere
 
-    config.parse(overrides, sweep=True)
+    if "distributed" in config.parse(overrides, sweep=True):
+        raise SettingError("distributed: is of a single run, and not of a grid (-m)")
     launch.check(overrides)
     Plugins.instance().register(Jobs)  # by hand, since Hydra finds none in an editable installation
     task = _Task()

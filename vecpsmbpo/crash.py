@@ -16,6 +16,8 @@ from pathlib import Path
 from vecpsmbpo import versions
 
 ADVICE = "try devices=1, compile_cache=false, or another Python (which brings another jax)"
+BESIDE_OTHERS = " beside other processes"
+ADVICE_TO_SEVERAL = "another process of the run may have gone; to go on, give the same command again, in all of them"
 REPORT = "crash.txt"  # in the run directory: Python's stack
 _FATAL, _REPORT, _END = "Fatal Python error: ", "report: ", "the end"
 # The last two are Slurm's, which sends them to all processes of a job.
@@ -106,7 +108,8 @@ def obituary(story: str) -> str | None:
         return None
     doing = next(line for line in reversed(lines) if not line.startswith(_REPORT))
     how = f"crashed ({stack.splitlines()[0]})" if fatal else "was killed, or crashed without a trace,"
-    text = f"vecpsmbpo: {how} while {doing}, with {versions.line()}; {ADVICE}"
+    advice = ADVICE_TO_SEVERAL if doing.endswith(BESIDE_OTHERS) else ADVICE
+    text = f"vecpsmbpo: {how} while {doing}, with {versions.line()}; {advice}"
     report = next((line.removeprefix(_REPORT) for line in reversed(lines) if line.startswith(_REPORT)), None)
     if fatal and report:
         with contextlib.suppress(OSError):

@@ -24,7 +24,7 @@ from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import SeedState, TrainState
 
 SEEDS, MEMBERS = "seeds", "members"
-_BY_SEED, _BY_MEMBER = PartitionSpec(SEEDS), PartitionSpec(SEEDS, MEMBERS)
+SHARED, BY_SEED, BY_MEMBER = PartitionSpec(), PartitionSpec(SEEDS), PartitionSpec(SEEDS, MEMBERS)
 
 MEMBER_WORK = 4  # of a member's updates, in fits of a model: about what hopper at the paper's size takes
 LEAST_PART = 32  # rows of a minibatch, below which its gradients take no longer than to average them
@@ -63,8 +63,7 @@ class Layout:
         on_cpu = devices[0].platform == "cpu"
         copies = partial(_copies, settings.n_members, settings.minibatch if on_cpu else 1)
         shape = _mesh_shape(len(settings.lanes), settings.n_models, settings.n_members, most, copies)
-        grid = np.array(devices[: math.prod(shape)]).reshape(shape)
-        processes.check_all_have_one_of(grid)
+        grid = np.array(processes.of_all(devices, math.prod(shape))).reshape(shape)
         return cls(
             mesh=Mesh(grid, (SEEDS, MEMBERS)),
             num_seeds=len(settings.lanes),
@@ -210,10 +209,10 @@ class Layout:
 
     def specs(self) -> TrainState:
         """Where every part of a train state lies: a prefix of its tree."""
-        parts: dict[str, Any] = dict.fromkeys(SeedState.__dataclass_fields__, _BY_SEED)
-        parts.update(models=_BY_MEMBER, agents=_BY_MEMBER, imagined=_BY_MEMBER)
-        shared: Any = PartitionSpec()
-        return TrainState(counters=shared, seeds=SeedState(**parts), env=_BY_SEED)
+        parts: dict[str, Any] = dict.fromkeys(SeedState.__dataclass_fields__, BY_SEED)
+        parts.update(models=BY_MEMBER, agents=BY_MEMBER, imagined=BY_MEMBER)
+        shared: Any = SHARED
+        return TrainState(counters=shared, seeds=SeedState(**parts), env=BY_SEED)
 
     def jit_shard_map(self, function: Callable, in_specs: Any, out_specs: Any, **jit: Any) -> Any:
         """`function` of a device's part, jitted over the whole mesh."""

@@ -167,8 +167,8 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
                 "temperature": None if ratios is None else _number(seeds.hyper.temperature[seed]),
             }
         )
-        if ratios is not None and seeds.own.bandit is not None:
-            bandit = jax.tree.map(lambda x, seed=seed: x[seed], seeds.own.bandit)
+        if (bandits := getattr(seeds.own, "bandit", None)) is not None:
+            bandit = jax.tree.map(lambda x, seed=seed: x[seed], bandits)
             lines[-1]["real_ratio_probs"] = mixture.probabilities(bandit).tolist()
     return lines
 
@@ -178,7 +178,8 @@ def _real_ratios(state: TrainState, settings: Settings) -> jax.Array | None:
     if not isinstance(settings, PosteriorSettings):
         return None
     of_seed = partial(mixture.real_ratios, settings, env_steps=state.counters.env_steps)
-    return jax.vmap(lambda hyper, bandit: of_seed(hyper, bandit))(state.seeds.hyper, state.seeds.own.bandit)
+    bandits = getattr(state.seeds.own, "bandit", None)
+    return jax.vmap(lambda hyper, bandit: of_seed(hyper, bandit))(state.seeds.hyper, bandits)
 
 
 def _lane(settings: Settings, index: int) -> Line:

@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from vecpsmbpo import processes
-from vecpsmbpo.layout import Layout
+from vecpsmbpo.layout import BY_MEMBER, BY_SEED, MEMBERS, SEEDS, SHARED, Layout
 from vecpsmbpo.types import TrainState
 
 
@@ -52,19 +53,43 @@ def _rearranged(state: TrainState, models: np.ndarray, members: np.ndarray) -> T
 def rings_to_host(layout: Layout, rings: jax.Array) -> list[np.ndarray]:
     """Each ring [C, F] of [S, C, F], or of the N·M members in [S, P, C, F], by itself.
 
-    Views, where the host's memory is the device's; copies, where other processes have some of the devices.
+    Views, where the host's memory is the device's. Of a run over several processes the first one gets them, and the
+    others nothing.
     """
+    members = [layout.places_of_members.tolist()] if rings.ndim == 4 else []
+    wanted = itertools.product(range(layout.num_seeds), *members)
+    if not rings.is_fully_addressable:
+        return _from_other_processes(layout, rings, list(wanted))
     by_place: dict[tuple[int, ...], np.ndarray] = {}
-    if rings.is_fully_addressable:
-        parts = [(_view(shard.data), shard.index) for shard in rings.addressable_shards]
-    else:
-        parts = [(processes.here(rings), (slice(None),) * rings.ndim)]
-    for part, index in parts:
-        where: Any = index
+    for shard in rings.addressable_shards:
+        part = _view(shard.data)
+        where: Any = shard.index
         for inside, place in zip(np.ndindex(part.shape[:-2]), _places(where[:-2], rings.shape), strict=True):
             by_place[place] = part[inside]
-    members = [layout.places_of_members.tolist()] if rings.ndim == 4 else []
-    return [by_place[place] for place in itertools.product(range(layout.num_seeds), *members)]
+    return [by_place[place] for place in wanted]
+
+
+def _from_other_processes(layout: Layout, rings: jax.Array, places: list[tuple[int, ...]]) -> list[np.ndarray]:
+    """One ring after the other, so that no device ever holds more than one that is not its own."""
+    axes, spec = ((SEEDS, MEMBERS), BY_MEMBER) if rings.ndim == 4 else ((SEEDS,), BY_SEED)
+
+    def pick(rings: jax.Array, *place: jax.Array) -> jax.Array:
+        inside, ring = jnp.bool_(True), rings
+        for index, axis in zip(place, axes, strict=True):
+            size = ring.shape[0]
+            own = index - jax.lax.axis_index(axis) * size
+            inside &= (own >= 0) & (own < size)
+            ring = jax.lax.dynamic_index_in_dim(ring, jnp.clip(own, 0, size - 1), keepdims=False)
+        # As bits: a sum of numbers would make +0 of -0.
+        return jax.lax.psum(jnp.where(inside, jax.lax.bitcast_convert_type(ring, jnp.int32), 0), axes)
+
+    program = layout.jit_shard_map(pick, (spec, *(SHARED,) * len(axes)), SHARED)
+    found = []
+    for place in places:
+        ring = processes.here(program(rings, *layout.everywhere(tuple(map(jnp.int32, place)), SHARED)))
+        if processes.is_first():
+            found.append(ring.view(np.float32))
+    return found
 
 
 def rings_from_host(layout: Layout, saved: list[Any], like: Any, spec: PartitionSpec) -> jax.Array:

@@ -1,27 +1,36 @@
 """One run over several processes, on one machine or on many: jax's distributed runtime, and what has to be agreed on.
 
-Every process runs this whole program, and the mesh of `layout` spans the devices of all of them. What the host decides
-must be the same in all, so it is made of what all of them see, or the first process decides: how long a chunk is, and
-whether a signal that one of them was sent stops the run. Simulators of the host are stepped by every process alike.
-Only the first process writes. With one process nothing here does anything.
+Every process runs this whole program, and the mesh of `layout` spans devices of all of them. What the host decides must
+be the same in all, so it is made of what all of them see, or asked of all: how long a chunk is, whether a signal that
+one of them was sent stops the run, whether something failed in one. Simulators of the host are stepped by every process
+alike. Only the first process writes. With one process nothing here does anything.
 """
 
+import contextlib
+import functools
 import re
+import sys
+import zlib
+from collections.abc import Iterator
 from typing import Any
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from vecpsmbpo import words
-from vecpsmbpo.settings import SettingError
+from vecpsmbpo import recorded, versions, words
+from vecpsmbpo.settings import SettingError, Settings
 
 LOST_AFTER_S = 30  # without a sign of life, a process counts as lost
+# How collectives say that a peer has gone.
+_GONE = re.compile("gloo|nccl|connection|unavailable|heartbeat|peer|coordination|deadline", re.IGNORECASE)
 
 
 class LostProcess(Exception):
-    """Another process of the run is gone, and with it a part of the state; the last checkpoint is whole."""
+    """Another process of the run is gone, or has failed; the last checkpoint is whole."""
+
+
+# ── coming together ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def join(distributed: str) -> None:
@@ -38,11 +47,15 @@ def join(distributed: str) -> None:
         return
     where = {} if distributed == "auto" else _address(distributed)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.config.update("jax_enable_preemption_service", False)  # SIGTERM is ours (`stopping`)
+    print("waiting for the other processes of the run …", file=sys.stderr, flush=True)
     try:
         jax.distributed.initialize(
             **where, heartbeat_timeout_seconds=LOST_AFTER_S, shutdown_timeout_seconds=LOST_AFTER_S
         )
     except (RuntimeError, ValueError) as error:
+        with contextlib.suppress(RuntimeError):
+            jax.distributed.shutdown()
         raise SettingError(f"distributed={distributed}: {words.of(error)}") from None
 
 
@@ -55,18 +68,41 @@ def _address(distributed: str) -> dict[str, Any]:
     return {"coordinator_address": found[1], "process_id": int(found[2]), "num_processes": int(found[3])}
 
 
-def check_all_have_one_of(devices: np.ndarray) -> None:
-    """That the mesh has devices of every process: one without any would have nothing to run.
+def check_same(settings: Settings) -> None:
+    """That all processes were started alike.
 
     Raises:
-        SettingError: it has not.
+        SettingError: they were not.
     """
-    used = {device.process_index for device in devices.flat}
-    if len(used) < jax.process_count():
+    plain = {**recorded.plain(settings), "distributed": "", **versions.current()}
+    if not agree(zlib.crc32(repr(plain).encode()) & 0x7FFFFFFF):
+        raise SettingError("distributed: the processes were not given the same settings, or are of different versions")
+
+
+def of_all(devices: list[Any], count: int) -> list[Any]:
+    """`count` of the devices, as many of each process as of the others: neighbours are of one process.
+
+    Raises:
+        SettingError: there are more processes than that, and one without a device would have nothing to run.
+    """
+    several = jax.process_count()
+    if count < several:
         raise SettingError(
-            f"distributed: there are {jax.process_count()} processes, but the devices of {len(used)} are all that so "
-            "many seeds and members can use; start fewer"
+            f"distributed: there are {several} processes, but so many seeds and members (and devices=) can use only "
+            f"{count} device(s); start fewer"
         )
+    chosen = []
+    for process in range(several):
+        own = [device for device in devices if device.process_index == process]
+        share = count // several + (process < count % several)
+        if share > len(own):
+            raise SettingError(f"distributed: process {process} has {len(own)} device(s), but {share} of it are needed")
+        chosen += own[:share]
+    return chosen
+
+
+def are_several() -> bool:
+    return jax.process_count() > 1
 
 
 def is_first() -> bool:
@@ -74,9 +110,12 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
+# ── between the mesh and this process ────────────────────────────────────────────────────────────────────────────
+
+
 def here(tree: Any) -> Any:
-    """What lies on the mesh, so that this process can read all of it: NumPy arrays and keys. All processes call it."""
-    return tree if jax.process_count() == 1 else jax.tree.map(_here, tree)
+    """What lies on the mesh, so that this process can read all of it. All processes call it."""
+    return jax.tree.map(_here, tree) if are_several() else tree
 
 
 def _here(x: Any) -> Any:
@@ -85,13 +124,19 @@ def _here(x: Any) -> Any:
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_here(jax.random.key_data(x)), impl=jax.random.key_impl(x))
     if not x.is_fully_replicated:
-        x = jax.jit(lambda x: x, out_shardings=NamedSharding(x.sharding.mesh, PartitionSpec()))(x)
+        assert isinstance(x.sharding, NamedSharding)
+        x = _replicating(x.sharding.mesh)(x)
     return np.asarray(x.addressable_data(0))
+
+
+@functools.cache
+def _replicating(mesh: Any) -> Any:
+    return jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, PartitionSpec()))
 
 
 def everywhere(tree: Any, shardings: Any) -> Any:
     """The inverse of `here`: laid out on the mesh. Every process has all of it, and the same."""
-    return tree if jax.process_count() == 1 else jax.tree.map(_everywhere, tree, shardings)
+    return jax.tree.map(_everywhere, tree, shardings) if are_several() else tree
 
 
 def _everywhere(x: Any, sharding: NamedSharding) -> jax.Array:
@@ -101,13 +146,73 @@ def _everywhere(x: Any, sharding: NamedSharding) -> jax.Array:
     return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
 
 
+# ── agreeing ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
 def of_first(number: int) -> int:
     """What the first process has."""
-    return number if jax.process_count() == 1 else int(multihost_utils.broadcast_one_to_all(np.int32(number)))
+    return int(_of_each(number)[0])
 
 
 def greatest(number: int) -> int:
-    """The greatest that any process has."""
-    if jax.process_count() == 1:
-        return number
-    return int(np.max(multihost_utils.process_allgather(np.int32(number))))
+    """The greatest that any process has. Also a meeting: nobody goes on before all have come here."""
+    return int(_of_each(number).max())
+
+
+def agree(number: int) -> bool:
+    """Whether all processes have the same."""
+    return bool((_of_each(number) == number).all())
+
+
+def _of_each(number: int) -> np.ndarray:
+    """What each process has, by index."""
+    if not are_several():
+        return np.array([number])
+    mesh = _one_device_each()
+    mine = jax.device_put(np.array([number], np.int32), mesh.local_devices[0])
+    shape, sharding = (jax.process_count(),), NamedSharding(mesh, PartitionSpec("processes"))
+    return _here(jax.make_array_from_single_device_arrays(shape, sharding, [mine]))
+
+
+@functools.cache
+def _one_device_each() -> Mesh:
+    firsts = {device.process_index: device for device in reversed(jax.devices())}
+    return Mesh(np.array([firsts[process] for process in range(jax.process_count())]), ("processes",))
+
+
+@contextlib.contextmanager
+def together() -> Iterator[None]:
+    """Around what may fail in one process alone, and in which none waits for another: then it fails in all.
+
+    Raises:
+        LostProcess: it has failed in another process, which says what.
+    """
+    if not are_several():
+        yield
+        return
+    failed: Exception | None = None
+    try:
+        yield
+    except Exception as error:
+        failed = error
+    if greatest(int(failed is not None)) and failed is None:
+        raise LostProcess("another process of the run has failed, and says why")
+    if failed is not None:
+        raise failed
+
+
+@contextlib.contextmanager
+def noticing_the_lost() -> Iterator[None]:
+    """Around all that waits for other processes.
+
+    Raises:
+        LostProcess: one of them is gone.
+    """
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if not are_several() or not _GONE.search(str(error)):
+            raise
+        why = str(error).strip().splitlines()[0][:200]
+        again = "the last checkpoint is whole; to go on, give the same command again, in all of them"
+        raise LostProcess(f"another process of the run is gone ({why}); {again}") from None

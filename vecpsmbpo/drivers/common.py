@@ -14,13 +14,10 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import PartitionSpec
 
 from vecpsmbpo.algorithms.base import Algorithm
-from vecpsmbpo.layout import SEEDS, Layout
+from vecpsmbpo.layout import BY_SEED, Layout
 from vecpsmbpo.types import EpisodeEnd, Hyper, TrainState
-
-SHARED, BY_SEED = PartitionSpec(), PartitionSpec(SEEDS)
 
 # For a program that runs once: what LLVM would make of it takes a minute of a core, without this a sixth of that.
 COMPILED_QUICKLY = {"xla_backend_optimization_level": 0}

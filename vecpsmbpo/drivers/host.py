@@ -12,9 +12,7 @@ import numpy as np
 from vecpsmbpo import health, processes
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers.common import (
-    BY_SEED,
     COMPILED_QUICKLY,
-    SHARED,
     Interrupted,
     Returns,
     broadcast_leaves,
@@ -24,6 +22,7 @@ from vecpsmbpo.drivers.common import (
     split_for_episodes,
 )
 from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
+from vecpsmbpo.layout import BY_SEED, SHARED
 from vecpsmbpo.schedule import begin_stride, observe_and_learn, over_seeds, split_keys
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
@@ -110,7 +109,9 @@ class HostDriver:
                 whole = before.replace(seeds=before.seeds.replace(**state.seeds.rings()))
                 raise Interrupted(step, whole, _stacked(news), error) from error
             state, frozen = self._settle(before, state)
-            news += [end.replace(done=end.done & ~np.asarray(processes.here(frozen))) for end in ends]
+            # Of the whole stride at once: to fetch what a step returns would be nine waits for the device at each.
+            ends, frozen = jax.tree.map(np.asarray, processes.here((ends, frozen)))
+            news += [end.replace(done=end.done & ~frozen) for end in ends]
         self._saved_env = None
         return state, _stacked(news)
 
@@ -122,7 +123,7 @@ class HostDriver:
         reward, next_obs, terminated, truncated, following = self.layout.everywhere(seen, BY_SEED)
         transition = Transition(obs, action, reward, next_obs, terminated)
         state, end = self._observe(state, memory, transition, truncated, key, keys, following, learning)
-        return state, jax.tree.map(np.asarray, processes.here(end))
+        return state, end
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
         seeds, obs_size = self.layout.num_seeds, self.algorithm.spec.obs_size

@@ -10,9 +10,7 @@ from jax.sharding import PartitionSpec
 from vecpsmbpo import health, processes
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers.common import (
-    BY_SEED,
     COMPILED_QUICKLY,
-    SHARED,
     EpisodeKeys,
     Returns,
     broadcast_leaves,
@@ -20,7 +18,7 @@ from vecpsmbpo.drivers.common import (
     evaluation_actions,
     split_for_episodes,
 )
-from vecpsmbpo.layout import SEEDS
+from vecpsmbpo.layout import BY_SEED, SEEDS, SHARED
 from vecpsmbpo.schedule import begin_stride, observe_and_learn, over_seeds, split_keys
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition

@@ -26,7 +26,7 @@ OPTIONS = {
     "group": arguments.names("settings whose values make a line each; without it, those that differ between the runs"),
     "steps": arguments.whole("up to which all are compared; 0: as far as all of a task have come", 0),
     "window": arguments.whole("epochs at the end that count as the final ones", 5, at_least=1),
-    "threshold": arguments.number("the value after whose first epoch `steps to it` counts"),
+    "threshold": arguments.number("a value; the table then says the first step with as much (`steps to`)"),
     "target": arguments.number("the value that counts as 1; without it, the task's own, if one is known"),
     "floor": arguments.number("the value that counts as 0; without it, the task's own, or 0"),
     "baseline": arguments.text("the line that the others are compared with; without it, the last"),

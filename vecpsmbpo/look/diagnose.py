@@ -243,8 +243,8 @@ def _evaluation_act(trained: "Trained", each: int) -> Any:
     import jax
     import jax.numpy as jnp
 
-    from vecpsmbpo.drivers.common import BY_SEED, SHARED, broadcast_leaves, evaluation_actions, evaluation_policies
-    from vecpsmbpo.layout import Layout
+    from vecpsmbpo.drivers.common import broadcast_leaves, evaluation_actions, evaluation_policies
+    from vecpsmbpo.layout import BY_SEED, SHARED, Layout
 
     algorithm = trained.algorithm
     policies = evaluation_policies(algorithm)(trained.state, trained.state.key)

@@ -25,10 +25,16 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
+PICTURES, TABLES = (".png", ".svg", ".pdf"), (".md", ".txt")
 OPTIONS = {
-    "size": arguments.choice("of the runs; without it, any", *config.options("size"), default=""),
+    "size": arguments.choice("of the runs, where they are of several", *config.options("size"), default=""),
     "runs": arguments.out("where the runs are", "runs"),
-    "out": arguments.out("the picture; of table1, the table", "", ".png", ".svg", ".pdf", ".md", ".txt"),
+    "out": arguments.out(
+        "the picture, by default named after the figure; of table1 the table, by default on the screen",
+        "",
+        *PICTURES,
+        *TABLES,
+    ),
 }
 LAST = 10  # evaluations that figure 7 averages
 STAGES = 3  # of training, in figures 8, 18 and 19
@@ -48,7 +54,7 @@ def run(words: Sequence[str]) -> int:
     Raises:
         SettingError: a mistake in `words`, there are no runs, or the file cannot be written.
     """
-    suffixes = (".md", ".txt") if "table1" in words else (".png", ".svg", ".pdf")
+    suffixes = TABLES if "table1" in words else PICTURES
     out_option = arguments.out(OPTIONS["out"].what, "", *suffixes)
     named, values = arguments.parse("figure", words, OPTIONS | {"out": out_option})
     if len(named) != 1 or named[0] not in DRAW:

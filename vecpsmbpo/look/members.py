@@ -82,8 +82,10 @@ class Trained:
         members; None where nothing is imagined."""
         if not self.imagined_rows:
             return None
-        rings, settings = self.state.imagined[self.index][self._members], self.run.settings
-        assert isinstance(settings, ImaginationSettings), "others leave their rings empty"
+        settings = self.run.settings
+        assert isinstance(settings, ImaginationSettings), "others have no rings"
+        assert self.state.imagined is not None
+        rings = self.state.imagined[self.index][self._members]
         newest = min(self.imagined_rows, int(imagination.retained_rows(settings, jnp.int32(self.step))))
         rows = (self.imagined_rows - 1 - random.integers(0, newest, most)) % rings.shape[1]
         return self._observations(rings, (random.integers(0, len(rings), most), rows))

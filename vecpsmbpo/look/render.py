@@ -28,7 +28,7 @@ OPTIONS = {
     "lane": arguments.whole("of which seed and swept value, counted from 0", 0),
     "seed": arguments.whole("of the episodes", 0),
     "steps": arguments.wholes("of training, whose checkpoints act side by side; without it, the newest"),
-    "length": arguments.whole("steps after which an episode is cut; 0: those of the task", 0),
+    "length": arguments.whole("steps after which an episode is cut, at most the run's own; 0: those", 0),
     "width": arguments.whole("of each picture in pixels; without it, as many show", 0, at_least=64),
     "out": arguments.out("the film, or a strip of its frames", "walk.mp4", ".mp4", ".gif", ".png"),
 }

@@ -54,18 +54,24 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
         LostProcess: another process of the run is gone.
     """
     runtime.configure(settings)
-    driver = make_driver(settings)
-    shapes = driver.shapes(*initial_inputs(settings))
-    memory = resources.check_memory(driver.algorithm, shapes)
     run_dir = Path(settings.run_dir)
-    with disk_errors(run_dir):
-        run_dir.mkdir(parents=True, exist_ok=True)
-        heeded = heeding_signals() if stop is None else contextlib.nullcontext(stop)
-        alone = alone_in(run_dir) if processes.is_first() else contextlib.nullcontext()
-        with alone, heeded as stop:
+    with processes.noticing_the_lost(), contextlib.ExitStack() as around:
+        processes.check_same(settings)
+        with processes.together():
+            driver = make_driver(settings)
+            shapes = driver.shapes(*initial_inputs(settings))
+            memory = resources.check_memory(driver.algorithm, shapes)
+        around.enter_context(disk_errors(run_dir))
+        with processes.together():
+            run_dir.mkdir(parents=True, exist_ok=True)
+            if processes.is_first():
+                around.enter_context(alone_in(run_dir))
             _check_not_emptied(run_dir)
-            crash.doing("making the first state", run_dir)
-            return _Session(settings, driver, shapes, memory).go(stop)
+        stop = around.enter_context(heeding_signals()) if stop is None else stop
+        crash.doing("making the first state", run_dir)
+        status = _Session(settings, driver, shapes, memory).go(stop)
+        processes.greatest(0)  # whoever left before the first has written its last would take it along
+        return status
 
 
 class _Session:
@@ -75,14 +81,13 @@ class _Session:
         self.settings, self.driver = settings, driver
         self.run_dir = Path(settings.run_dir)
         keep = settings.keep_checkpoints
-        self.checkpoints = checkpoint.Checkpoints(self.run_dir / checkpoint.FOLDER, settings, keep=keep)
-        saved = self.checkpoints.restore(shapes, driver.layout, warn=_warn)
-        if saved and saved.step > settings.total_steps:
-            raise SettingError(f"total_steps={settings.total_steps}: the run has already done {saved.step}")
-        if processes.of_first(saved.step if saved else 0) != (saved.step if saved else 0):
+        with processes.together():
+            self.checkpoints = checkpoint.Checkpoints(self.run_dir / checkpoint.FOLDER, settings, keep=keep)
+            saved = self.checkpoints.restore(shapes, driver.layout, warn=_warn)
+            if saved and saved.step > settings.total_steps:
+                raise SettingError(f"total_steps={settings.total_steps}: the run has already done {saved.step}")
+        if not processes.agree(saved.step if saved else -1):
             raise SettingError(f"run_dir={self.run_dir}: processes find different checkpoints in it; it must be shared")
-        if processes.is_first():
-            config.save(settings, self.run_dir)  # now that it is known to be the run's own
         self.state = saved.state if saved else driver.init(*initial_inputs(settings))
         self.saved_step = saved.step if saved else None
         self.watch = Stopwatch(saved.host["seconds"] if saved else 0.0)
@@ -91,14 +96,14 @@ class _Session:
         self.env_steps = saved.step if saved else 0
         self.health = processes.here(self.state.seeds.health)
         self.frozen = np.asarray(health.frozen(self.health))
-        self.log: metrics.RunLog | metrics.NoLog
-        if processes.is_first():
-            marks = saved.host.get("logs", {}) if saved else {}
-            self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn, marks)
-            self.display = Display(driver.algorithm, self.env_steps)
-        else:
-            self.log = metrics.NoLog()
-            self.display = Display(driver.algorithm, self.env_steps, Console(quiet=True))
+        self.log: metrics.RunLog | metrics.NoLog = metrics.NoLog()
+        with processes.together():
+            if processes.is_first():
+                config.save(settings, self.run_dir)  # now that it is known to be the run's own
+                marks = saved.host.get("logs", {}) if saved else {}
+                self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn, marks)
+        self.display = Display(driver.algorithm, self.env_steps, None if processes.is_first() else Console(quiet=True))
+        self.stopped_by = 0  # the signal that any process was sent
         self.memory = memory
         self.epoch_began = time.perf_counter()
         self.epoch_steps_done = 0
@@ -117,24 +122,18 @@ class _Session:
                     return self._status
                 self.log.session({"env_steps": self.env_steps, **versions.current(), "devices": self._devices()})
                 # At once, and not after hours.
-                resources.check_disk(self.run_dir, self.state, settings.total_steps, self.driver.layout)
+                self._check_disk(settings.total_steps)
                 if self.saved_step is None:
                     self._save()
                 self._compile()
                 while self.env_steps < settings.total_steps and not self.frozen.all() and not self._asked_to(stop):
                     self._chunk()
                 self._save()
-                return self._farewell(stop)
+                return self._farewell()
         except Interrupted as error:
             return self._failed(f"at step {error.step}", error)
         except SimulatorError as error:
             return self._failed(f"in the evaluation at step {self.env_steps}", error)
-        except jax.errors.JaxRuntimeError as error:
-            if jax.process_count() == 1:
-                raise
-            why = str(error).strip().splitlines()[0][:200]
-            saved = f"saved at step {self.saved_step}; to continue, in all of them: {self._to_continue}"
-            raise processes.LostProcess(f"another process of the run is gone ({why}); {saved}") from None
         finally:
             self.log.close()
             self.checkpoints.close()
@@ -144,10 +143,8 @@ class _Session:
         if processes.greatest(int(stop.save)):
             stop.save = False
             self._save()
-        asked = processes.greatest(stop.requested or 0)
-        if asked:  # only then: a signal may come at any time, this line included
-            stop.requested = asked
-        return bool(asked)
+        self.stopped_by = processes.greatest(stop.requested or 0)
+        return self.stopped_by > 0
 
     def _devices(self) -> list[str]:
         """What those are that the run uses: `cpu`, `NVIDIA H100 80GB HBM3`."""
@@ -173,7 +170,7 @@ class _Session:
         self.display.say(f"compiling the training program{cached} …")
         crash.doing("compiling the training program")
         self.driver.compile(self.state)
-        crash.doing("training")
+        crash.doing("training" + (crash.BESIDE_OTHERS if self.settings.distributed else ""))
         self.display.say(f"compiled in {self.driver.compile_seconds:.1f} s")
 
     def _chunk(self) -> None:
@@ -305,19 +302,24 @@ class _Session:
 
     def _save(self) -> None:
         if self.saved_step != self.env_steps:
-            resources.check_disk(self.run_dir, self.state, self.env_steps, self.driver.layout)
+            self._check_disk(self.env_steps)
             host = {"env": self.driver.save_env(), "seconds": self.watch(), "logs": self.log.marks}
             self.checkpoints.save(self.env_steps, self.state, host, self.driver.layout)
             self.saved_step = self.env_steps
 
-    def _farewell(self, stop: Stop) -> int:
+    def _check_disk(self, env_steps: int) -> None:
+        with processes.together():
+            if processes.is_first():
+                resources.check_disk(self.run_dir, self.state, env_steps, self.driver.layout)
+
+    def _farewell(self) -> int:
         self.display.say(f"saved at step {self.env_steps} of {self.settings.total_steps}: {self.run_dir}")
         if self.frozen.all():
             self.display.say("stopped: every lane is frozen; what is saved is the last good state of each")
             return self._status
         if self.env_steps < self.settings.total_steps:
             self.display.say(f"to continue: {self._to_continue}")
-            return 128 + (stop.requested or 0)
+            return 128 + self.stopped_by
         self.display.say(f"to evaluate: vecpsmbpo eval {shlex.quote(f'run_dir={self.run_dir}')} episodes=10")
         return self._status
 
@@ -334,6 +336,8 @@ class _Session:
     @property
     def _to_continue(self) -> str:
         """The command, as a shell and Hydra read it."""
+        if self.settings.distributed:
+            return "the same command again, in every process"
         return f"vecpsmbpo train {shlex.quote(config.as_override('run_dir', self.run_dir))}"
 
 
