@@ -23,7 +23,7 @@ from vecpsmbpo.settings import SettingError, Settings
 
 LOST_AFTER_S = 30  # without a sign of life, a process counts as lost
 # How collectives say that a peer has gone.
-_GONE = re.compile("gloo|nccl|connection|unavailable|heartbeat|peer|coordination|deadline", re.IGNORECASE)
+_GONE = re.compile("gloo|nccl|connection (reset|closed|refused)|unavailable|heartbeat|coordination", re.IGNORECASE)
 
 
 class LostProcess(Exception):
@@ -210,7 +210,7 @@ def noticing_the_lost() -> Iterator[None]:
     """
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # the latter from compiled functions called by Python
         if not are_several() or not _GONE.search(str(error)):
             raise
         why = str(error).strip().splitlines()[0][:200]
