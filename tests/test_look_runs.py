@@ -1,7 +1,6 @@
 """Reading the logs of runs, and which of their lanes belong together."""
 
 import json
-import time
 
 import numpy as np
 import pytest
@@ -67,20 +66,13 @@ def test_a_step_written_twice_counts_once(tmp_path):
     np.testing.assert_array_equal(runs.load(path).lanes[0].epochs["eval_return"], [7, 8, 3])
 
 
-def test_reading_is_linear(tmp_path):
-    """Four times the lines take less than twelve times as long (a square law: sixteen), and are arrays: 8 bytes a
-    number, 4 a probability."""
-    seconds = []
-    for count in (20_000, 80_000):
-        lines = looks.episodes(100)
-        text = "".join(json.dumps(line) + "\n" for line in lines) * (count // 100)
-        (tmp_path / "episodes.jsonl").write_text(text)
-        began = time.process_time()  # not what other programs take
-        log = runs.read(tmp_path / "episodes.jsonl")
-        seconds.append(time.process_time() - began)
-        assert len(log) == count
-        assert sum(column.nbytes for column in log.columns.values()) == count * (8 * (len(lines[0]) - 1) + 4 * 4)
-    assert seconds[1] < 12 * seconds[0]
+def test_logs_are_kept_as_arrays(tmp_path):
+    """8 bytes a number and 4 a probability. (How long reading takes: tools/bench_look.py.)"""
+    lines = looks.episodes(100)
+    (tmp_path / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines) * 50)
+    log = runs.read(tmp_path / "episodes.jsonl")
+    assert len(log) == 5000
+    assert sum(column.nbytes for column in log.columns.values()) == 5000 * (8 * (len(lines[0]) - 1) + 4 * 4)
 
 
 # ── grouping ────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -107,6 +107,7 @@ def begun(start, tmp_path):
     return begin
 
 
+@pytest.mark.slow
 def test_where_one_is_gone_the_others_end_and_a_signal_to_one_stops_all(begun, tmp_path):
     for lost, said in ((1, "another process of the run is gone"), (0, "another process of the run")):
         running = begun()
