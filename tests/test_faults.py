@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.helpers import environment, tiny
+from tests.helpers import command, environment, tiny
 from vecpsmbpo import cli, config, envs, runtime, stopping, words
 from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
 from vecpsmbpo.settings import SettingError
@@ -142,6 +142,14 @@ def test_a_device_that_is_not_there_is_one_line(error, monkeypatch):
     monkeypatch.delenv("JAX_PLATFORMS")
     with pytest.raises(SettingError, match="JAX finds no device"):
         runtime.configure(tiny())
+
+
+def test_the_command_says_so_too(tmp_path, monkeypatch):
+    """Nothing on the way out asks for the device again."""
+    monkeypatch.setenv("JAX_PLATFORMS", "foo")
+    result = command("train", "size=tiny", cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (2, "vecpsmbpo: JAX_PLATFORMS=foo: no such device here\n")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_flag_that_xla_does_not_know_is_one_line(monkeypatch):

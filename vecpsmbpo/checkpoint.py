@@ -171,9 +171,9 @@ class Checkpoints:
 
 def _alone() -> Any:
     """Where there are several processes: what one of them reads or writes is no business of the others."""
-    index = jax.process_index()
     if not processes.are_several():
         return ocp.options.MultiprocessingOptions()
+    index = jax.process_index()
     return ocp.options.MultiprocessingOptions(index, {index}, barrier_sync_key_prefix=f"process{index}")
 
 

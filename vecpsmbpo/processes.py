@@ -74,6 +74,8 @@ def check_same(settings: Settings) -> None:
     Raises:
         SettingError: they were not.
     """
+    if not are_several():
+        return
     plain = {**recorded.plain(settings), "distributed": "", **versions.current()}
     if not agree(zlib.crc32(repr(plain).encode()) & 0x7FFFFFFF):
         raise SettingError("distributed: the processes were not given the same settings, or are of different versions")
@@ -102,7 +104,8 @@ def of_all(devices: list[Any], count: int) -> list[Any]:
 
 
 def are_several() -> bool:
-    return jax.process_count() > 1
+    """Whether this is one of several processes. Asks for no device where nothing was joined: there may be none."""
+    return jax.distributed.is_initialized() and jax.process_count() > 1
 
 
 def is_first() -> bool:
