@@ -1,5 +1,6 @@
 """What is made of a checkpoint: videos, exported policies, diagnostics. One tiny run serves all tests."""
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -14,7 +15,7 @@ from PIL import Image
 import vecpsmbpo
 from tests import looks
 from tests.helpers import command, environment
-from vecpsmbpo import cli, config, metrics, training
+from vecpsmbpo import cli, config, envs, metrics, training
 from vecpsmbpo.look import diagnose, export, members, render, runs, stage, states
 
 # What rendering needs of the machine; without it (a bare container) the tests of pictures have nothing to test.
@@ -83,6 +84,50 @@ def test_an_exported_policy_acts_the_same_without_this_package(trained, tmp_path
     before = (out / "policy.npz").read_bytes()
     assert cli.main(["export", str(trained), f"out={out}", f"member={about['member']}"]) == 0
     assert (out / "policy.npz").read_bytes() == before
+
+
+@pytest.fixture(scope="module")
+def policy(trained):
+    """The best policy of the second seed, exported."""
+    out = trained.parent / "policy"
+    assert cli.main(["export", str(trained), "lane=1", f"out={out}"]) == 0
+    return out
+
+
+def test_an_exported_policy_is_loaded_as_a_run_is(trained, policy, capsys):
+    loaded, run = vecpsmbpo.load(policy), vecpsmbpo.load(trained, lane=1)
+    assert repr(loaded) == f"<Policy {policy}: cartpole_swingup, ops_mbpo, 80 steps>"
+    assert loaded.settings == dataclasses.replace(run.settings, num_seeds=1, seed=1, run_dir="")
+    obs = np.random.default_rng(0).normal(size=(2, 3, 5)).astype(np.float32)
+    np.testing.assert_allclose(loaded.policy(obs), run.policy(obs), atol=1e-5)
+
+    episodes = loaded.evaluate(seed=3, episodes=2)
+    env = envs.make("cartpole_swingup", "host", num_envs=2, seed=3)
+    env.episode_length = 25  # of size=tiny
+    obs, earned = env.reset(), np.zeros(2)
+    for _ in range(25):
+        step = env.step(loaded.policy(obs))
+        obs, earned = step.obs, earned + step.reward
+    np.testing.assert_allclose(episodes["return"], earned, rtol=1e-5)
+    assert list(episodes["length"]) == [25, 25]
+
+    capsys.readouterr()
+    assert cli.main(["eval", f"run_dir={policy}", "episodes=2"]) == 0
+    assert capsys.readouterr().out.splitlines()[-2].replace("│", " ").split()[:2] == ["1", "2"]
+
+
+@draws
+def test_an_exported_policy_is_drawn(policy, tmp_path):
+    result = command("render", str(policy), "length=4", "width=64", "out=a.png", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert Image.open(tmp_path / "a.png").size == (4 * 64, 48)
+
+
+def test_infinity_is_kept_in_an_exported_policy():
+    settings = config.compose(["algo=ps_mbpo", "sweep.real_ratio=[0.1,0.7]", "num_seeds=2", "seed=4"])
+    record = json.loads(json.dumps(export.settings_of(settings, 3), allow_nan=False))
+    found = config.from_record(record, "policy.json")
+    assert (found.temperature, found.real_ratio, found.seed, found.lanes) == (np.inf, 0.7, 5, ({"seed": 5},))
 
 
 def test_the_real_data_are_exported_as_minari_reads_them(trained, tmp_path, capsys):
@@ -313,13 +358,22 @@ MISTAKES = [
     (["render", "run", "out=a.gif", "steps=41"], "steps=41: must be of 0, 40, 80, which checkpoints are kept of"),
     (["render", "run", "out=a.gif", "steps=[0,x]"], "steps=[0,x]: must be whole numbers, separated by commas"),
     (["render", "run", "out=a.gif", "steps=0,40", "member=all"], "member=all: with steps= there is room for one"),
+    (["render", "policy", "out=a.gif", "member=0,0"], "member=0,0: policy is one policy, without a run"),
+    (["eval", "run_dir=policy", "actions=sampled"], "actions=sampled: policy is one policy and its mean actions"),
+    (["eval", "run_dir=policy", "episodes=0"], "episodes=0: must be"),
+    (["eval", "run_dir=cut"], "cut: holds no policy that can be read"),
+    (["eval", "run_dir=old"], "old: holds no policy that can be read (KeyError: 'settings')"),
     (["export", "run", "also=rlds"], "also=rlds: must be of jax, onnx, minari, separated by commas"),
 ]
 
 
 @pytest.fixture
-def shelf(trained, tmp_path, monkeypatch):
+def shelf(trained, policy, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    for name, about in (("policy", None), ("cut", '{"algo"'), ("old", '{"algo": "ops_mbpo"}')):
+        shutil.copytree(policy, tmp_path / name)
+        if about:
+            (tmp_path / name / "policy.json").write_text(about)
     for name in ("run", "run2"):
         (tmp_path / name).symlink_to(trained)
     (tmp_path / "file").write_text("")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from vecpsmbpo.settings import SettingError
 
 if TYPE_CHECKING:
-    from vecpsmbpo.api import Run
+    from vecpsmbpo.api import Policy, Run
 
 __version__ = "0.1.0"
 __all__ = ["SettingError", "load", "train"]
@@ -26,8 +26,8 @@ def train(**settings: Any) -> "Run":
     return api.train(**settings)
 
 
-def load(run_dir: str | Path, lane: int = 0) -> "Run":
-    """The run in a directory that training has written: see `api.Run`."""
+def load(path: str | Path, lane: int = 0) -> "Run | Policy":
+    """The run, or the exported policy, in a directory: see `api.Run` and `api.Policy`."""
     from vecpsmbpo import api
 
-    return api.Run(run_dir, lane)
+    return api.load(path, lane)

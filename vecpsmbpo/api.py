@@ -12,7 +12,7 @@ import numpy as np
 from vecpsmbpo import config, dynamics, jsonl
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.evaluate import evaluate
-from vecpsmbpo.look import members, runs
+from vecpsmbpo.look import exported, members, runs
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.training import train as run_training
 from vecpsmbpo.types import Model
@@ -156,6 +156,60 @@ class Run:
         columns = {name: np.repeat([lane[name] for lane in lanes], episodes) for name in lanes[0]}
         columns["episode"] = np.tile(np.arange(episodes), count)
         return _table(columns | {"return": returns.episode_return.ravel(), "length": returns.length.ravel()})
+
+
+class Policy:
+    """A directory that `vecpsmbpo export` has written: a policy by itself.
+
+    Attributes:
+        path: where it lies.
+        settings: of the run that it comes from.
+        about: task, run, algo, env_steps, seed, member and sizes, by name.
+    """
+
+    def __init__(self, path: str | Path):
+        """
+        Raises:
+            SettingError: its files cannot be read.
+        """
+        self._exported = exported.load(path)
+        self.path, self.settings, self.about = self._exported.path, self._exported.settings, self._exported.about
+
+    def __repr__(self) -> str:
+        return f"<Policy {self.path}: {self.settings.task}, {self.settings.algo}, {self.about.get('env_steps')} steps>"
+
+    def policy(self, obs: Any) -> Array:
+        """obs [..., O] -> mean action [..., A] in [-1, 1]."""
+        return self._exported.act(obs)
+
+    def evaluate(self, seed: int = 0, **how: Any) -> Table:
+        """Whole episodes: a row per episode.
+
+        Args:
+            seed: of the environments.
+            how: as the words of `vecpsmbpo eval`: episodes, backend.
+
+        Raises:
+            SettingError: a mistake in them, or the task's suite is not installed.
+        """
+        returns, lengths = exported.evaluate(self._exported, how, seed)
+        return _table({"episode": np.arange(len(returns)), "return": returns, "length": lengths})
+
+
+def load(path: str | Path, lane: int = 0) -> Run | Policy:
+    """The run, or the exported policy, in a directory.
+
+    Args:
+        lane: of a run: which seed, or seed with a swept value.
+
+    Raises:
+        SettingError: there is neither, or no such lane.
+    """
+    if not exported.is_one(path):
+        return Run(path, lane)
+    if lane:
+        raise SettingError(f"lane={lane}: {path} is one policy, without lanes")
+    return Policy(path)
 
 
 def train(**settings: Any) -> Run:

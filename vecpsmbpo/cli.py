@@ -198,14 +198,18 @@ def _multirun(overrides: list[str]) -> int:
 
 def _eval(rest: list[str]) -> int:
     from vecpsmbpo import config
+    from vecpsmbpo.look import exported
 
-    stored, settings = config.parse_evaluation(rest)
+    run_dir, given = config.parse_evaluation(rest)
+    policy = exported.load(run_dir) if exported.is_one(run_dir) else None
+    stored = policy.settings if policy else config.load(run_dir)
+    settings = config.for_evaluation(stored, given)
     with _nothing_to_save():
         from vecpsmbpo import runtime
         from vecpsmbpo.evaluate import show
 
         runtime.check_flags()
-    return show(stored, settings)
+    return exported.show(policy, given) if policy else show(stored, settings)
 
 
 def _envs(rest: list[str]) -> int:

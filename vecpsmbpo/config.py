@@ -234,21 +234,37 @@ def load(run_dir: str | Path) -> Settings:
     Raises:
         SettingError: there are none, or they cannot be read.
     """
-    path = Path(run_dir) / CONFIG_FILE
+    where = f"run_dir={run_dir}: its {CONFIG_FILE}"
     try:
-        stored = yaml.safe_load(path.read_text())
+        record = yaml.safe_load((Path(run_dir) / CONFIG_FILE).read_text())
+    except OSError:
+        raise SettingError(f"run_dir={run_dir}: holds no {CONFIG_FILE}, so no run") from None
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        raise SettingError(f"{where} cannot be read ({_first_line(error)})") from None
+    return dataclasses.replace(from_record(record, where), run_dir=str(run_dir))
+
+
+def from_record(record: Any, where: str) -> Settings:
+    """The settings that `recorded.plain` wrote down.
+
+    Args:
+        record: what is found there, which may be anything.
+        where: for the error.
+
+    Raises:
+        SettingError: it is none.
+    """
+    try:
         # What the run does not know came to this program after it, and is off by default.
-        values = {**_defaults(stored["algo"]), "recipe": "paper", **stored}
+        values = {**_defaults(record["algo"]), "recipe": "paper", **record}
         for group in ("env", "algo"):
             _check_override(group, values[group])
         _check_values(values["env"], dict(values.get("env_options", ())))
-        return dataclasses.replace(build(values), run_dir=str(run_dir))
-    except OSError:
-        raise SettingError(f"run_dir={run_dir}: holds no {CONFIG_FILE}, so no run") from None
+        return build(values)
     except SettingError as error:
-        raise SettingError(f"run_dir={run_dir}: its {CONFIG_FILE} has {error}") from None
-    except (LookupError, TypeError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise SettingError(f"run_dir={run_dir}: its {CONFIG_FILE} cannot be read ({_first_line(error)})") from None
+        raise SettingError(f"{where} has {error}") from None
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
+        raise SettingError(f"{where} cannot be read ({_first_line(error)})") from None
 
 
 def resolve(overrides: Sequence[str], tree: DictConfig | None = None) -> Settings:
@@ -309,13 +325,13 @@ EVALUATION = {
 }
 
 
-def parse_evaluation(overrides: Sequence[str]) -> tuple[Settings, Settings]:
-    """Settings of the run in `run_dir=`, as stored and as they are to be evaluated.
+def parse_evaluation(overrides: Sequence[str]) -> tuple[str, dict[str, str]]:
+    """The `run_dir=` that is to be evaluated, and what else is said, by the names in `EVALUATION`.
 
     Raises:
-        SettingError: a mistake in `overrides`.
+        SettingError: there is no such name, or no `run_dir=`.
     """
-    given: dict[str, Any] = {}
+    given: dict[str, str] = {}
     for text in overrides:
         name, equals, value = text.partition("=")
         if not equals or name not in ("run_dir", *EVALUATION):
@@ -323,8 +339,7 @@ def parse_evaluation(overrides: Sequence[str]) -> tuple[Settings, Settings]:
         given[name] = value
     if "run_dir" not in given:
         raise SettingError("run_dir: eval needs run_dir=…, a directory that train has written")
-    stored = load(given.pop("run_dir"))
-    return stored, for_evaluation(stored, given)
+    return given.pop("run_dir"), given
 
 
 def for_evaluation(stored: Settings, given: Mapping[str, Any]) -> Settings:

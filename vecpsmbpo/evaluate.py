@@ -1,10 +1,12 @@
 """Whole episodes of a trained run's policies: what `vecpsmbpo eval` shows and `Run.evaluate` returns."""
 
 import contextlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -37,15 +39,20 @@ def show(stored: Settings, settings: Settings) -> int:
     """Prints what `evaluate` finds; the exit status."""
     step, returns = evaluate(stored, settings)
     who = f"policy: {settings.eval_policy}, {settings.eval_actions} actions"
-    table = Table(title=f"{settings.task} ({settings.backend}) at step {step}, {who}")
-    for column in (*settings.lanes[0], "episodes", "return", "± s.d.", "lowest", "highest", "length"):
-        table.add_column(column, justify="right")
-    for index, lane in enumerate(settings.lanes):
-        values, lengths = returns.episode_return[index], returns.length[index]
-        row = (values.mean(), values.std(), values.min(), values.max(), lengths.mean())
-        table.add_row(*map(str, lane.values()), str(values.size), *(f"{value:.1f}" for value in row))
-    Console(highlight=False).print(table)
+    title = f"{settings.task} ({settings.backend}) at step {step}, {who}"
+    print_returns(title, zip(settings.lanes, returns.episode_return, returns.length, strict=True))
     return 0
+
+
+def print_returns(title: str, rows: Iterable[tuple[dict[str, Any], np.ndarray, np.ndarray]]) -> None:
+    """A table: of every row what names it, and returns and lengths of its episodes, [E] each."""
+    table, rows = Table(title=title), list(rows)
+    for column in (*rows[0][0], "episodes", "return", "± s.d.", "lowest", "highest", "length"):
+        table.add_column(column, justify="right")
+    for names, values, lengths in rows:
+        row = (values.mean(), values.std(), values.min(), values.max(), lengths.mean())
+        table.add_row(*map(str, names.values()), str(values.size), *(f"{value:.1f}" for value in row))
+    Console(highlight=False).print(table)
 
 
 def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:

@@ -2,12 +2,13 @@
 
 policy.npz    the weights, as NumPy reads them
 act.py        the policy in NumPy alone, with the weights beside it
-policy.json   which task, run, member and step it is of
+policy.json   which task, run, member and step it is of, and the run's settings
 policy.jax    with also=jax: the same for CPUs, GPUs and TPUs, StableHLO that `jax.export.deserialize` reads
 policy.onnx   with also=onnx: the same for ONNX's runtimes
 minari/       with also=minari: the real data, as a Minari data set
 """
 
+import dataclasses
 import functools
 import importlib.util
 import json
@@ -18,9 +19,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vecpsmbpo import arguments
+from vecpsmbpo import arguments, jsonl, recorded
 from vecpsmbpo.look import dataset, files, runs
-from vecpsmbpo.settings import SettingError
+from vecpsmbpo.look.exported import ABOUT_FILE, WEIGHTS_FILE
+from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.settings.parts import SacSettings
 
 if TYPE_CHECKING:
@@ -33,7 +35,7 @@ OPTIONS = {
     "out": arguments.out("where the files go", "policy"),
 }
 
-FILES = ("policy.npz", "act.py", "policy.json")
+FILES = (WEIGHTS_FILE, "act.py", ABOUT_FILE)
 ADDITIONS = {"jax": ("flatbuffers",), "onnx": ("onnx",), "minari": ("minari", "h5py")}  # and what each needs
 OPSET, IR_VERSION = 17, 8  # of ONNX, from 2022: every runtime since then reads it
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -72,7 +74,7 @@ def run(words: Sequence[str]) -> int:
     out = options["out"]
     if out.exists() and not out.is_dir():
         raise SettingError(f"out={out}: must be a directory")
-    files.check_writable(out / "policy.npz")
+    files.check_writable(out / WEIGHTS_FILE)
     for name in options["also"]:
         _check_extra(name)
     found = runs.load(path)
@@ -129,11 +131,19 @@ def export(trained: "Trained", out: Path, member: str) -> dict[str, np.ndarray]:
         "member": members.member_names(run)[index],
         "obs_size": trained.algorithm.spec.obs_size,
         "action_size": trained.algorithm.spec.action_size,
+        "settings": settings_of(run.settings, trained.index),
     }
-    files.write(out / "policy.npz", functools.partial(_save, layers))
+    files.write(out / WEIGHTS_FILE, functools.partial(_save, layers))
     files.write_text(out / "act.py", ACT)
-    files.write_text(out / "policy.json", json.dumps(about, indent=2) + "\n")
+    files.write_text(out / ABOUT_FILE, json.dumps(about, indent=2, allow_nan=False) + "\n")
     return layers
+
+
+def settings_of(settings: Settings, lane: int) -> dict[str, Any]:
+    """Of a run with this lane alone, as JSON can have them."""
+    alone = dataclasses.replace(settings, num_seeds=1, sweep=(), **settings.lanes[lane])
+    values = {name: value for name, value in recorded.plain(alone).items() if name != "run_dir"}
+    return {name: jsonl.INFINITY if value == float("inf") else value for name, value in values.items()}
 
 
 def _index(trained: "Trained", member: str) -> int:

@@ -48,7 +48,13 @@ class Step(NamedTuple):
 
 
 class World(Protocol):
-    """E environments of one task, stepped together."""
+    """E environments of one task, stepped together.
+
+    Attributes:
+        length: the most steps of an episode.
+    """
+
+    length: int
 
     def reset(self) -> Array:
         """[E, O]."""
@@ -68,8 +74,8 @@ def _programs(env: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
 class MjxWorld:
     """MJX environments. One whose episode is over goes on: nobody looks at it any more."""
 
-    def __init__(self, env: Any, count: int, seed: int):
-        self._seed, self._count = seed, count
+    def __init__(self, env: Any, count: int, seed: int, length: int = 0):
+        self._seed, self._count, self.length = seed, count, length or env.spec.episode_length
         self.rewind()
         self._reset, self._step = _programs(env)
         self.state: Any = None  # leaves [E, ...]
@@ -93,7 +99,7 @@ class HostWorld:
 
     def __init__(self, env: HostEnv, length: int):
         self._env = env
-        env.episode_length = length
+        self.length = env.episode_length = length or env.spec.episode_length
 
     def reset(self) -> Array:
         return self._env.reset()
@@ -107,13 +113,14 @@ class HostWorld:
 
 
 def world(settings: Settings, count: int, length: int, seed: int) -> World:
-    """`count` environments of a run's task on the run's backend, for episodes of up to `length` steps.
+    """`count` environments of a run's task on the run's backend, for episodes of up to `length` steps, or where that is
+    0 the task's own limit.
 
     Raises:
         SettingError: the task's suite is not installed.
     """
     env = envs.make(settings.env, settings.backend, num_envs=count, seed=seed, **dict(settings.env_options))
-    return MjxWorld(env, count, seed) if settings.backend == "mjx" else HostWorld(env, length)
+    return MjxWorld(env, count, seed, length) if settings.backend == "mjx" else HostWorld(env, length)
 
 
 def collect(

@@ -16,11 +16,12 @@ from rich.console import Console
 from rich.progress import track
 
 from vecpsmbpo import arguments
-from vecpsmbpo.look import files, runs, stage
+from vecpsmbpo.look import exported, files, runs, stage
 from vecpsmbpo.look.runs import Run
-from vecpsmbpo.settings import SettingError
+from vecpsmbpo.settings import SettingError, Settings
 
 Array = np.ndarray
+Policies = list[tuple[str, Callable[[Any], Any]]]  # name, and obs [..., O] -> action [..., A]
 
 OPTIONS = {
     "episodes": arguments.whole("one after the other", 1, at_least=1),
@@ -62,19 +63,24 @@ def run(words: Sequence[str]) -> int:
         SettingError: a mistake in `words`, nothing to draw with, or the file cannot be written.
     """
     named, options = arguments.parse("render", words, OPTIONS)
-    (path,) = arguments.run_dirs("render", named, most=1)
+    policy = exported.load(named[0]) if len(named) == 1 and exported.is_one(named[0]) else None
     out = options["out"]
+    policies: Callable[[], Policies]
+    if policy is None:
+        (path,) = arguments.run_dirs("render", named, most=1)
+        found = runs.load(path)
+        _check(found, options)
+        settings, policies = found.settings, functools.partial(_policies, found, options)
+    else:
+        for name in ("member", "lane", "steps"):
+            if options[name] != OPTIONS[name].default:
+                raise SettingError(f"{name}={options[name]}: {policy.path} is one policy, without a run")
+        settings, policies = policy.settings, lambda: [(policy.path.name, policy.act)]
     files.check_writable(out)
-    found = runs.load(path)
-    runs.check_lane(found, options["lane"])
-    kept = runs.kept_steps(found)
-    if missing := [step for step in options["steps"] if step not in kept]:
-        known = f"must be of {', '.join(map(str, kept))}, which checkpoints are kept of" if kept else "there is none"
-        raise SettingError(f"steps={missing[0]}: {known}")
     if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise SettingError(f"out={out}: .mp4 needs imageio-ffmpeg; pip install 'vecpsmbpo[video]', or take .gif")
     os.environ["MUJOCO_GL"] = platform()
-    frames, frame_s = film(found, options)
+    frames, frame_s = film(settings, policies(), options)
     files.write(out, functools.partial(_write, frames, frame_s))
     print(f"written: {out}")
     return 0
@@ -102,17 +108,19 @@ def platform() -> str:
     raise SettingError("render: there is neither EGL nor OSMesa to draw with; apt-get install libegl1 or libosmesa6")
 
 
-def film(run: Run, options: dict[str, Any]) -> tuple[list[Array], float]:
-    """Episodes of the members asked for, side by side: frames [H, W, 3] uint8, and seconds between them.
+def film(settings: Settings, policies: Policies, options: dict[str, Any]) -> tuple[list[Array], float]:
+    """Episodes of policies, side by side: frames [H, W, 3] uint8, and seconds between them.
 
-    Every member begins in the same state.
+    Every one begins in the same state.
+
+    Args:
+        settings: of the run, which has the task.
 
     Raises:
-        SettingError: as `members.load` and `members.acting`; the task cannot be drawn.
+        SettingError: the task cannot be drawn.
     """
-    policies = _policies(run, options)
     width = options["width"] or (SINGLE if len(policies) == 1 else TILE)
-    studio = Studio(run, [name for name, _ in policies], width, options["seed"])
+    studio = Studio(settings, [name for name, _ in policies], width, options["seed"])
     columns = 1 if options["out"].suffix.lower() == ".png" else int(np.ceil(np.sqrt(len(policies))))
     frames: list[Array] = []
     console = Console(stderr=True)
@@ -125,7 +133,18 @@ def film(run: Run, options: dict[str, Any]) -> tuple[list[Array], float]:
     return frames, studio.frame_s
 
 
-def _policies(run: Run, options: dict[str, Any]) -> list[tuple[str, Callable[[Any], Any]]]:
+def _check(run: Run, options: dict[str, Any]) -> None:
+    """Raises:
+    SettingError: the run has no such lane, or keeps no such checkpoint.
+    """
+    runs.check_lane(run, options["lane"])
+    kept = runs.kept_steps(run)
+    if missing := [step for step in options["steps"] if step not in kept]:
+        known = f"must be of {', '.join(map(str, kept))}, which checkpoints are kept of" if kept else "there is none"
+        raise SettingError(f"steps={missing[0]}: {known}")
+
+
+def _policies(run: Run, options: dict[str, Any]) -> Policies:
     """The members asked for, as they are now; or at `steps` of training one of them, as in figure 8.
 
     Raises:
@@ -148,8 +167,7 @@ def _policies(run: Run, options: dict[str, Any]) -> list[tuple[str, Callable[[An
 class Studio:
     """One stage for each policy; all begin in the same state."""
 
-    def __init__(self, run: Run, names: Sequence[str], width: int, seed: int):
-        settings = run.settings
+    def __init__(self, settings: Settings, names: Sequence[str], width: int, seed: int):
         self._names = names
         self._stages = [stage.make(settings, width, seed) for _ in names]
         self._every = max(1, round(1 / (FRAMES_PER_S * self._stages[0].dt)))
