@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from tools import bench
+from tools.benches import pieces
 from vecpsmbpo import config
 
 
@@ -16,7 +16,7 @@ def test_products_are_counted_inside_loops_only():
         return jax.lax.scan(body, x @ x, None, length=3)[0]  # and one before
 
     text = jax.jit(program).lower(jnp.ones((8, 8))).compile().as_text()
-    assert bench.loop_pieces(text)["products"] == 2
+    assert pieces.loop_pieces(text)["products"] == 2
 
 
 FUSIONS = {"none": 180, "layer": 280}  # of jax 0.10.2
@@ -28,6 +28,6 @@ def test_an_update_is_at_most_45_products(norm):
     two critics for the actor's loss, 9. Backwards: two critics to weights and hidden layers, 10, two critics to the
     actions, 6, and the actor, 5. XLA makes sums of some of those with a single column. Of fusions there may be a
     quarter more than there were when this was written: XLA changes, too."""
-    found = bench.pieces_of_update(config.compose(["env=hopper", f"critic_norm={norm}", "updates_per_step=5"]))
+    found = pieces.pieces_of_update(config.compose(["env=hopper", f"critic_norm={norm}", "updates_per_step=5"]))
     assert 30 <= found["products"] <= 45
     assert found["fusions"] <= 1.25 * FUSIONS[norm]

@@ -1,6 +1,6 @@
 """Times MBPO of mbrl-lib 0.2.0 for `bench.py compare`; runs in a virtual environment of its own (docs/results.md).
 
-    PEER/bin/python tools/peer_mbrl_lib.py SETTINGS
+    PEER/bin/python tools/benches/peer_mbrl_lib.py SETTINGS
 
 SETTINGS is JSON: `updates`, `models`, `width`, `batch`, `starts`, `random_steps`, `learning_steps`. Prints a line of
 JSON: the seconds of every learning step.

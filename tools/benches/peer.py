@@ -38,7 +38,7 @@ def compare(words: Sequence[str]) -> dict[str, Any]:
     """Milliseconds of a learning step, fits and rollouts included, and of the updates in it."""
     alone, options = arguments.parse("compare", words, OPTIONS)
     if alone or not Path(options["peer"]).is_file():
-        raise SettingError("compare: needs peer=, a Python that has mbrl-lib (bench_peer.py says how)")
+        raise SettingError("compare: needs peer=, a Python that has mbrl-lib (benches/peer.py says how)")
     theirs, ours = [], []
     for _ in range(options["repeats"]):
         theirs.append(time_peer(options["peer"]))

@@ -1,0 +1,121 @@
+"""Environments by themselves, and what a step around a simulator of the host costs."""
+
+import os
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+
+from tools.benches.timing import best_seconds
+from vecpsmbpo import config, envs, runtime
+from vecpsmbpo.envs import registry
+from vecpsmbpo.training.programs import initial_inputs, make_driver
+
+
+def bench_envs() -> list[dict[str, Any]]:
+    """Every task (or those named) on every backend that it has; actions are uniform."""
+    found = []
+    for backend in ("mjx", "host"):
+        for name in registry.names(backend):
+            if sys.argv[2:] and name not in sys.argv[2:]:
+                continue
+            for batch in (1, 10, 100):
+                measure = mjx_steps if backend == "mjx" else host_steps
+                found.append({"env": name, "backend": backend, "batch": batch, **measure(name, batch)})
+                print(found[-1], file=sys.stderr, flush=True)
+    return found
+
+
+def mjx_steps(name: str, batch: int, **options: Any) -> dict[str, float]:
+    env, steps = envs.make(name, "mjx", **options), 50
+
+    def step(state, key):
+        action = jax.random.uniform(key, (batch, env.action_size), minval=-1.0, maxval=1.0)
+        return jax.vmap(env.step)(state, action), None
+
+    @jax.jit
+    def run(state, key):
+        return jax.lax.scan(step, state, jax.random.split(key, steps))[0]
+
+    key = jax.random.key(0)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, batch))
+    began = time.perf_counter()
+    compiled = run.lower(state, key).compile()
+    compile_seconds = time.perf_counter() - began
+    state = compiled(state, key)  # past the start, where nothing touches yet
+    return {
+        "steps_per_s": batch * steps / best_seconds(lambda: compiled(state, key), 3),
+        "compile_seconds": compile_seconds,
+    }
+
+
+def host_steps(name: str, batch: int) -> dict[str, float]:
+    env, steps, random = envs.make(name, "host", num_envs=batch), 50, np.random.default_rng(0)
+    env.reset()
+
+    def run():
+        for _ in range(steps):
+            env.step(random.uniform(-1, 1, (batch, env.spec.action_size)))
+
+    return {"steps_per_s": batch * steps / best_seconds(run, 3)}
+
+
+def bench_host() -> list[dict[str, Any]]:
+    """Steps per second of a batch of simulators: one after the other (as `HostEnv` does it), each handed to a pool of
+    threads or to a process of its own (Gymnasium's `AsyncVectorEnv`, which has Gymnasium's tasks only)."""
+    found = []
+    for name in sys.argv[2:] or ("hopper", "ball_in_cup", "window_open"):
+        for batch in (2, 10, 100):
+            env, steps = envs.make(name, "host", num_envs=batch), 50
+            env.reset()
+            actions = np.random.default_rng(0).uniform(-1, 1, (steps, batch, env.spec.action_size))
+            loop = best_seconds(lambda env=env, actions=actions: [env.step(action) for action in actions], 5)
+            env.reset()
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+
+                def threads(env=env, actions=actions, pool=pool):
+                    for action in actions:
+                        list(pool.map(lambda one, given: one.step(given), env.simulators, action))
+
+                threaded = best_seconds(threads, 5)
+            row = {"env": name, "batch": batch, "loop_steps_per_s": batch * steps / loop}
+            row["threads_steps_per_s"] = batch * steps / threaded
+            if name == "hopper" and batch <= 10:
+                vector = gymnasium.vector.AsyncVectorEnv([lambda: gymnasium.make("Hopper-v5")] * batch)
+                vector.reset()
+                processes = best_seconds(lambda v=vector, a=actions: [v.step(x.astype("float32")) for x in a], 5)
+                vector.close()
+                row["processes_steps_per_s"] = batch * steps / processes
+            found.append(row)
+    return found
+
+
+def bench_hosted() -> dict[str, Any]:
+    """Of a step around a simulator of the host what is neither the simulator nor learning: acting, observing, and the
+    way to the device and back."""
+    settings = config.compose(["env=hopper", "size=cpu", "warmup_steps=1000", *sys.argv[2:], "backend=host"])
+    runtime.configure(settings)
+    driver = make_driver(settings)
+    state = driver.init(*initial_inputs(settings))
+    driver.compile(state)
+    strides = settings.model_update_every // settings.stride
+    state, _ = driver.run(state, strides)
+    seconds = []
+    for _ in range(2):
+        began = time.perf_counter()
+        state, _ = driver.run(state, strides)
+        seconds.append((time.perf_counter() - began) / settings.model_update_every)
+    lanes = len(settings.lanes)
+    simulator = lanes / host_steps(settings.env, lanes)["steps_per_s"]
+    return {
+        "task": settings.env,
+        "seeds": lanes,
+        "members": settings.n_members,
+        "ms_per_step": 1e3 * min(seconds),
+        "ms_of_simulator": 1e3 * simulator,
+        "ms_around_it": 1e3 * (min(seconds) - simulator),
+    }
