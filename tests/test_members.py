@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from tests import looks
 from tests.helpers import command, environment
 from vecpsmbpo import cli, config, envs, metrics, training
 from vecpsmbpo.look import diagnose, export, members, render, runs, stage, states
+from vecpsmbpo.settings import SettingError
 
 # What rendering needs of the machine; without it (a bare container) the tests of pictures have nothing to test.
 try:
@@ -114,6 +116,14 @@ def test_an_exported_policy_is_loaded_as_a_run_is(trained, policy, capsys):
     capsys.readouterr()
     assert cli.main(["eval", f"run_dir={policy}", "episodes=2"]) == 0
     assert capsys.readouterr().out.splitlines()[-2].replace("│", " ").split()[:2] == ["1", "2"]
+
+
+def test_a_run_stays_one_when_its_policy_is_exported_into_it(trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "run")
+    assert cli.main(["export", str(trained), f"out={tmp_path / 'run'}"]) == 0
+    assert vecpsmbpo.load(tmp_path / "run", lane=1).complete
+    with pytest.raises(SettingError, match="run_dir="):
+        vecpsmbpo.load("x" * 300)
 
 
 @draws
@@ -333,6 +343,20 @@ def test_an_environment_that_can_draw_itself_does():
     np.testing.assert_array_equal(stage.camera(types.SimpleNamespace(env=env), 64)(), picture)
 
 
+DAMAGED: dict[str, Callable[[Path], object]] = {
+    "cut": lambda path: (path / "policy.json").write_text('{"algo"'),
+    "old": lambda path: (path / "policy.json").write_text('{"algo": "ops_mbpo"}'),
+    "list": lambda path: (path / "policy.json").write_text("[]"),
+    "deep": lambda path: (path / "policy.json").write_text("[" * 100_000),
+    "short": lambda path: (path / "policy.npz").write_bytes((path / "policy.npz").read_bytes()[:-9]),
+    "empty": lambda path: (path / "policy.npz").write_bytes(b""),
+    "words": lambda path: np.savez(path / "policy.npz", kernel_0=np.full((5, 1), "x"), bias_0=np.zeros(1)),
+    "other": lambda path: np.savez(path / "policy.npz", kernel_0=np.zeros((7, 1)), bias_0=np.zeros(1)),
+    "broken": lambda path: np.savez(
+        path / "policy.npz", kernel_0=np.zeros((5, 3)), bias_0=np.zeros(3), kernel_1=np.zeros((4, 1)), bias_1=np.ones(1)
+    ),
+}
+
 MISTAKES = [
     (["render"], "run_dir: render needs the directory of a run"),
     (["render", "run", "run2"], "run_dir: render takes 1 run, not 2"),
@@ -358,11 +382,11 @@ MISTAKES = [
     (["render", "run", "out=a.gif", "steps=41"], "steps=41: must be of 0, 40, 80, which checkpoints are kept of"),
     (["render", "run", "out=a.gif", "steps=[0,x]"], "steps=[0,x]: must be whole numbers, separated by commas"),
     (["render", "run", "out=a.gif", "steps=0,40", "member=all"], "member=all: with steps= there is room for one"),
-    (["render", "policy", "out=a.gif", "member=0,0"], "member=0,0: policy is one policy, without a run"),
+    (["render", "policy", "out=a.gif", "member=0,0"], "member: policy is one policy, without a run"),
     (["eval", "run_dir=policy", "actions=sampled"], "actions=sampled: policy is one policy and its mean actions"),
     (["eval", "run_dir=policy", "episodes=0"], "episodes=0: must be"),
-    (["eval", "run_dir=cut"], "cut: holds no policy that can be read"),
-    (["eval", "run_dir=old"], "old: holds no policy that can be read (KeyError: 'settings')"),
+    *((["eval", f"run_dir={name}"], f"{name}: holds no policy that can be read") for name in DAMAGED),
+    (["render", "short", "out=a.gif"], "short: holds no policy that can be read (BadZipFile: "),
     (["export", "run", "also=rlds"], "also=rlds: must be of jax, onnx, minari, separated by commas"),
 ]
 
@@ -370,10 +394,9 @@ MISTAKES = [
 @pytest.fixture
 def shelf(trained, policy, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name, about in (("policy", None), ("cut", '{"algo"'), ("old", '{"algo": "ops_mbpo"}')):
+    for name, damage in {"policy": lambda path: None, **DAMAGED}.items():
         shutil.copytree(policy, tmp_path / name)
-        if about:
-            (tmp_path / name / "policy.json").write_text(about)
+        damage(tmp_path / name)
     for name in ("run", "run2"):
         (tmp_path / name).symlink_to(trained)
     (tmp_path / "file").write_text("")

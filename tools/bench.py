@@ -22,7 +22,7 @@ import jax
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tools.benches import peer, pieces, profile, program, simulators
+from tools.benches import epoch, peer, pieces, program, simulators
 from vecpsmbpo.settings import SettingError
 
 
@@ -39,7 +39,7 @@ BENCHES = {
     "pieces": pieces.bench_pieces,
     "capacity": program.bench_capacity,
     "program": program.bench_program,
-    "profile": profile.bench_profile,
+    "profile": epoch.bench_profile,
     "envs": simulators.bench_envs,
     "host": simulators.bench_host,
     "hosted": simulators.bench_hosted,

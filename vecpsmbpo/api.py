@@ -192,7 +192,8 @@ class Policy:
         Raises:
             SettingError: a mistake in them, or the task's suite is not installed.
         """
-        returns, lengths = exported.evaluate(self._exported, how, seed)
+        settings = exported.for_evaluation(self._exported, how)
+        returns, lengths = exported.evaluate(self._exported, settings, seed)
         return _table({"episode": np.arange(len(returns)), "return": returns, "length": lengths})
 
 

@@ -22,7 +22,7 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo train -m env=hopper real_ratio=0,0.05   one run after the other, for every value (Hydra multirun)
   vecpsmbpo train env=hopper sweep.real_ratio=[0,0.05]      every value at once, in one program
   vecpsmbpo train -m experiment=fig2 size=cpu       the runs behind a figure of the paper
-  vecpsmbpo eval run_dir=runs/x episodes=10         evaluate it
+  vecpsmbpo eval run_dir=runs/x episodes=10         evaluate it, or the policy that export has written there
   vecpsmbpo plot runs/x runs/y out=curves.png       learning curves, grouped by what differs
   vecpsmbpo compare runs/x runs/y                   the same as a table, with intervals
   vecpsmbpo report runs/x out=report.html           all a run has to show, on one page
@@ -201,15 +201,17 @@ def _eval(rest: list[str]) -> int:
     from vecpsmbpo.look import exported
 
     run_dir, given = config.parse_evaluation(rest)
-    policy = exported.load(run_dir) if exported.is_one(run_dir) else None
-    stored = policy.settings if policy else config.load(run_dir)
-    settings = config.for_evaluation(stored, given)
+    if policy := exported.load(run_dir) if exported.is_one(run_dir) else None:
+        stored, settings = policy.settings, exported.for_evaluation(policy, given)
+    else:
+        stored = config.load(run_dir)
+        settings = config.for_evaluation(stored, given)
     with _nothing_to_save():
         from vecpsmbpo import runtime
         from vecpsmbpo.evaluate import show
 
         runtime.check_flags()
-    return exported.show(policy, given) if policy else show(stored, settings)
+    return exported.show(policy, settings) if policy else show(stored, settings)
 
 
 def _envs(rest: list[str]) -> int:

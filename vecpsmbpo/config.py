@@ -263,7 +263,7 @@ def from_record(record: Any, where: str) -> Settings:
         return build(values)
     except SettingError as error:
         raise SettingError(f"{where} has {error}") from None
-    except (LookupError, TypeError, ValueError, RecursionError) as error:
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError, RecursionError) as error:
         raise SettingError(f"{where} cannot be read ({_first_line(error)})") from None
 
 
@@ -338,7 +338,7 @@ def parse_evaluation(overrides: Sequence[str]) -> tuple[str, dict[str, str]]:
             raise SettingError(f"{text}: eval takes run_dir=…, {'=…, '.join(EVALUATION)}=…")
         given[name] = value
     if "run_dir" not in given:
-        raise SettingError("run_dir: eval needs run_dir=…, a directory that train has written")
+        raise SettingError("run_dir: eval needs run_dir=…, a directory that train or export has written")
     return given.pop("run_dir"), given
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from vecpsmbpo import checkpoint, crash, resources, runtime
@@ -46,7 +47,7 @@ def show(stored: Settings, settings: Settings) -> int:
 
 def print_returns(title: str, rows: Iterable[tuple[dict[str, Any], np.ndarray, np.ndarray]]) -> None:
     """A table: of every row what names it, and returns and lengths of its episodes, [E] each."""
-    table, rows = Table(title=title), list(rows)
+    table, rows = Table(title=escape(title)), list(rows)
     for column in (*rows[0][0], "episodes", "return", "± s.d.", "lowest", "highest", "length"):
         table.add_column(column, justify="right")
     for names, values, lengths in rows:

@@ -1,4 +1,4 @@
-"""Times MBPO of mbrl-lib 0.2.0 for `bench.py compare`; runs in a virtual environment of its own (docs/results.md).
+"""Times MBPO of mbrl-lib 0.2.0 for `bench.py compare`; runs in a virtual environment of its own (peer.py).
 
     PEER/bin/python tools/benches/peer_mbrl_lib.py SETTINGS
 

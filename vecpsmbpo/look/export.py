@@ -133,9 +133,13 @@ def export(trained: "Trained", out: Path, member: str) -> dict[str, np.ndarray]:
         "action_size": trained.algorithm.spec.action_size,
         "settings": settings_of(run.settings, trained.index),
     }
+    try:
+        text = json.dumps(about, indent=2, allow_nan=False) + "\n"
+    except ValueError:  # a task's own option may be infinite
+        raise SettingError(f"run_dir={run.path}: has an option that JSON cannot have, infinity or NaN") from None
     files.write(out / WEIGHTS_FILE, functools.partial(_save, layers))
     files.write_text(out / "act.py", ACT)
-    files.write_text(out / ABOUT_FILE, json.dumps(about, indent=2, allow_nan=False) + "\n")
+    files.write_text(out / ABOUT_FILE, text)
     return layers
 
 

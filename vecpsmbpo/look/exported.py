@@ -1,20 +1,29 @@
 """A policy that `vecpsmbpo export` has written, where a run would be: `vecpsmbpo.load`, `eval` and `render` take it."""
 
 import json
-from collections.abc import Mapping
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vecpsmbpo import config
+from vecpsmbpo import config, crash, words
+from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import SettingError, Settings
 
 Array = np.ndarray
+Layers = list[tuple[Array, Array]]
 
 WEIGHTS_FILE, ABOUT_FILE = "policy.npz", "policy.json"
 ALONE = ("policy", "actions", "devices")  # what is told of a run's evaluation, and has no meaning for one policy
+DAMAGE = (
+    *(OSError, LookupError, TypeError, AttributeError, ValueError, RecursionError),
+    *(EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error),
+)
 
 
 @dataclass(frozen=True)
@@ -31,7 +40,7 @@ class Exported:
     path: Path
     settings: Settings
     about: Mapping[str, Any]
-    layers: list[tuple[Array, Array]]
+    layers: Layers
 
     def act(self, obs: Any) -> Array:
         """obs [..., O] -> mean action [..., A] in [-1, 1]."""
@@ -43,7 +52,12 @@ class Exported:
 
 
 def is_one(path: str | Path) -> bool:
-    return (Path(path) / ABOUT_FILE).is_file()
+    """Whether a directory holds an exported policy, and no run."""
+    path = Path(path)
+    try:
+        return (path / ABOUT_FILE).is_file() and not (path / config.CONFIG_FILE).exists()
+    except (OSError, ValueError):  # a name too long, or with a null byte: whoever takes it for a run says so
+        return False
 
 
 def load(path: str | Path) -> Exported:
@@ -58,46 +72,68 @@ def load(path: str | Path) -> Exported:
         record = about.pop("settings")
         with np.load(path / WEIGHTS_FILE) as stored:
             layers = [(stored[f"kernel_{i}"], stored[f"bias_{i}"]) for i in range(len(stored.files) // 2)]
-        if not layers or layers[-1][1].shape != (about["action_size"],):
-            raise ValueError("weights of another policy")
-    except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
-        raise SettingError(f"{path}: holds no policy that can be read ({type(error).__name__}: {error})") from None
-    return Exported(path, replace(config.from_record(record, f"{path}: its {ABOUT_FILE}"), run_dir=""), about, layers)
+        settings = replace(config.from_record(record, f"{path}: its {ABOUT_FILE}"), run_dir="")
+        _check_shapes(layers, registry.TASKS[settings.env].sizes)
+    except DAMAGE as error:
+        raise SettingError(f"{path}: holds no policy that can be read ({words.of(error)})") from None
+    return Exported(path, settings, about, layers)
 
 
-def evaluate(policy: Exported, given: Mapping[str, Any], seed: int = 0) -> tuple[Array, Array]:
-    """Whole episodes of the task, side by side: their returns and lengths, [E] each.
-
-    Args:
-        given: `episodes` and `backend`, as of `vecpsmbpo eval`.
-        seed: of the environments.
+def _check_shapes(layers: Layers, task: Sequence[int] | None) -> None:
+    """That layers are of one network, for observations and actions as the task has them, where that is known.
 
     Raises:
-        SettingError: a mistake in `given`, or the task's suite is not installed.
+        ValueError: they are not.
+    """
+    whole = all(kernel.ndim == 2 and kernel.shape[1:] == bias.shape for kernel, bias in layers)
+    kinds = {array.dtype.kind for layer in layers for array in layer}
+    if not layers or not whole or kinds != {"f"} or any(len(k) != len(b) for (_, b), (k, _) in pairwise(layers)):
+        raise ValueError(f"{WEIGHTS_FILE} has not the layers of a policy")
+    has = (len(layers[0][0]), len(layers[-1][1]))
+    if task and has != tuple(task[:2]):
+        raise ValueError(f"from {has[0]} observations to {has[1]} actions, where the task has {task[0]} and {task[1]}")
+
+
+def for_evaluation(policy: Exported, given: Mapping[str, Any]) -> Settings:
+    """Settings of its run, with `episodes` and `backend` as of `vecpsmbpo eval`.
+
+    Raises:
+        SettingError: a mistake in `given`.
     """
     for name in given:
         if name in ALONE:
             raise SettingError(f"{name}={given[name]}: {policy.path} is one policy and its mean actions, without a run")
-    settings = config.for_evaluation(policy.settings, given)
+    return replace(config.for_evaluation(policy.settings, given), devices=1)
 
+
+def evaluate(policy: Exported, settings: Settings, seed: int = 0) -> tuple[Array, Array]:
+    """Whole episodes of the task, side by side: their returns and lengths, [E] each.
+
+    Args:
+        settings: as `for_evaluation` gives them.
+        seed: of the environments.
+
+    Raises:
+        SettingError: the task's suite is not installed, or it is not what the policy was trained on.
+    """
     import jax
 
     from vecpsmbpo import runtime
     from vecpsmbpo.look import fresh
 
-    runtime.configure(replace(settings, devices=1))
+    runtime.configure(settings)
     world = fresh.world(settings, settings.eval_episodes, settings.episode_length, seed)
+    crash.doing("evaluating")
     certain = np.zeros(settings.eval_episodes)
     seen = fresh.collect(world, lambda t, obs, key: (policy.act(obs), certain), world.length, jax.random.key(seed))
     return seen.reward.sum(axis=1), seen.there.sum(axis=1)
 
 
-def show(policy: Exported, given: Mapping[str, Any]) -> int:
+def show(policy: Exported, settings: Settings) -> int:
     """Prints what `evaluate` finds; the exit status."""
     from vecpsmbpo.evaluate import print_returns
 
-    returns, lengths = evaluate(policy, given)
-    backend = config.for_evaluation(policy.settings, given).backend
-    title = f"{policy.settings.task} ({backend}), {policy.path}: mean actions"
+    returns, lengths = evaluate(policy, settings)
+    title = f"{settings.task} ({settings.backend}), {policy.path}: mean actions"
     print_returns(title, [({"seed": policy.about.get("seed")}, returns, lengths)])
     return 0

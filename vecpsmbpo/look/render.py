@@ -1,5 +1,6 @@
 """`vecpsmbpo render`: what trained policies do, drawn without a display by the original simulator, if there is one."""
 
+import dataclasses
 import functools
 import importlib.util
 import os
@@ -74,8 +75,8 @@ def run(words: Sequence[str]) -> int:
     else:
         for name in ("member", "lane", "steps"):
             if options[name] != OPTIONS[name].default:
-                raise SettingError(f"{name}={options[name]}: {policy.path} is one policy, without a run")
-        settings, policies = policy.settings, lambda: [(policy.path.name, policy.act)]
+                raise SettingError(f"{name}: {policy.path} is one policy, without a run")
+        settings, policies = policy.settings, functools.partial(_alone, policy)
     files.check_writable(out)
     if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise SettingError(f"out={out}: .mp4 needs imageio-ffmpeg; pip install 'vecpsmbpo[video]', or take .gif")
@@ -142,6 +143,14 @@ def _check(run: Run, options: dict[str, Any]) -> None:
     if missing := [step for step in options["steps"] if step not in kept]:
         known = f"must be of {', '.join(map(str, kept))}, which checkpoints are kept of" if kept else "there is none"
         raise SettingError(f"steps={missing[0]}: {known}")
+
+
+def _alone(policy: exported.Exported) -> Policies:
+    """An exported policy. It needs no JAX, but its task may."""
+    from vecpsmbpo import runtime
+
+    runtime.configure(dataclasses.replace(policy.settings, devices=1))
+    return [(policy.path.resolve().name, policy.act)]
 
 
 def _policies(run: Run, options: dict[str, Any]) -> Policies:
