@@ -103,7 +103,7 @@ def for_evaluation(policy: Exported, given: Mapping[str, Any]) -> Settings:
     for name in given:
         if name in ALONE:
             raise SettingError(f"{name}={given[name]}: {policy.path} is one policy and its mean actions, without a run")
-    return replace(config.for_evaluation(policy.settings, given), devices=1)
+    return config.for_evaluation(policy.settings, given)
 
 
 def evaluate(policy: Exported, settings: Settings, seed: int = 0) -> tuple[Array, Array]:
@@ -114,7 +114,7 @@ def evaluate(policy: Exported, settings: Settings, seed: int = 0) -> tuple[Array
         seed: of the environments.
 
     Raises:
-        SettingError: the task's suite is not installed, or it is not what the policy was trained on.
+        SettingError: the task's suite is not installed.
     """
     import jax
 

@@ -1,6 +1,5 @@
 """`vecpsmbpo render`: what trained policies do, drawn without a display by the original simulator, if there is one."""
 
-import dataclasses
 import functools
 import importlib.util
 import os
@@ -149,7 +148,7 @@ def _alone(policy: exported.Exported) -> Policies:
     """An exported policy. It needs no JAX, but its task may."""
     from vecpsmbpo import runtime
 
-    runtime.configure(dataclasses.replace(policy.settings, devices=1))
+    runtime.configure(policy.settings)
     return [(policy.path.resolve().name, policy.act)]
 
 
