@@ -11,6 +11,7 @@ Each part replaces its own rows of results/faults.csv. Parts:
     twice       a second process in the directory of a run
     disk        disks of many sizes, which fill up in one write or another; then made larger, and gone on with
     kills       kill -9 at random moments until the run is complete
+    memory      limits on address space, from the start, while compiling and while training; then gone on without
 """
 
 import contextlib
@@ -18,6 +19,7 @@ import csv
 import io
 import json
 import random
+import resource
 import shutil
 import signal
 import subprocess
@@ -25,6 +27,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -39,6 +42,8 @@ RUN = ["size=tiny", "env=ball_in_cup", "loggers=[]"]  # 40 steps an epoch, a che
 STOPPED, END = 120, 160
 SAVED_WITHIN_S = 10.0
 ANSWER_S = 100
+MEMORIES_MB = (200, 600, 1000, 1800, 2600, 3400, 4200, 5000)
+MORE_MB = (0, 1, 4, 16, 64, 128, 256)  # than it holds
 DISKS_KB = (64, 400, 800, 1100, 1200, 1300, 1400, 1600, 1800, 2000, 2200, 2400, 2600)
 Found = tuple[str, str]  # what was tried, and how it ended: FINE or what was wrong
 SAME, ONE_LINE = "same end", "one line"
@@ -70,10 +75,16 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def one_line(status: int, errors: str, expected: int = 2) -> str:
+def one_line(status: int, errors: str, expected: int | None = 2) -> str:
+    """`expected`: the exit status; None is any but 0, since the system says how a process ends that it takes memory from."""
+    if expected is None:
+        expected = status or 1
     told = [line for line in errors.splitlines() if line.startswith("vecpsmbpo: ") and "warning" not in line]
-    others = [line for line in errors.splitlines() if not line.startswith("vecpsmbpo: ")]
-    return ONE_LINE if (status, len(told), others) == (expected, 1, []) else f"status {status}: {errors[-200:]!r}"
+    native = ("terminate called", "  what():  ")  # C++'s own last words
+    others = [line for line in errors.splitlines() if not line.startswith(("vecpsmbpo: ", *native))]
+    if (status, len(told), others) == (expected, 1, []):
+        return ONE_LINE
+    return f"status {status}, {len(told)} line(s), and besides {' '.join(others)[-200:]!r}"
 
 
 def here(arguments: list[str]) -> tuple[int, str]:
@@ -94,9 +105,12 @@ def command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess:
     return subprocess.CompletedProcess(arguments, process.returncode, said, errors)
 
 
-def started(*arguments: str, cwd: Path) -> subprocess.Popen:
+def started(*arguments: str, cwd: Path, memory_mb: int | None = None) -> subprocess.Popen:
     pipe, train = subprocess.PIPE, argv("train", *arguments, one_thread=True)
-    return subprocess.Popen(train, cwd=cwd, env=environment(), stdout=pipe, stderr=pipe, text=True)
+    limit = None
+    if memory_mb:
+        limit = partial(resource.setrlimit, resource.RLIMIT_AS, (memory_mb << 20, memory_mb << 20))
+    return subprocess.Popen(train, cwd=cwd, env=environment(), stdout=pipe, stderr=pipe, text=True, preexec_fn=limit)
 
 
 def undisturbed(folder: Path, backend: str) -> Path:
@@ -245,7 +259,32 @@ def kills(folder: Path, options: dict) -> Iterator[Found]:
             yield f"{backend}: {done - before} kills of run {runs}", same_end(folder / run_dir, reference)
 
 
-PARTS = {part.__name__: part for part in (careless, files, signals, twice, disk, kills)}
+def memory(folder: Path, options: dict) -> Iterator[Found]:
+    reference = undisturbed(folder, "host")
+    moments = [("at the start", limit) for limit in MEMORIES_MB]
+    moments += [(f"from {line!r} on", more) for line in ("compiling", "step") for more in MORE_MB]
+    for number, (moment, allowed_mb) in enumerate(moments):
+        arguments = (*RUN, "backend=host", f"total_steps={END}", f"run_dir=memory{number}")
+        if moment == "at the start":
+            process = started(*arguments, cwd=folder, memory_mb=allowed_mb)
+        else:
+            process = started(*arguments, cwd=folder)
+            next(line for line in process.stdout if line.startswith(moment.split("'")[1]))
+            held = int(Path(f"/proc/{process.pid}/statm").read_text().split()[0]) * resource.getpagesize()
+            resource.prlimit(process.pid, resource.RLIMIT_AS, (held + (allowed_mb << 20),) * 2)
+        try:
+            errors = process.communicate(timeout=ANSWER_S)[1]
+        except subprocess.TimeoutExpired:
+            process.kill()
+            errors = process.communicate()[1] + "has not ended"
+        ended = SAME if process.returncode == 0 else one_line(process.returncode, errors, expected=None)
+        if ended in FINE:
+            command(*arguments, cwd=folder)
+            ended = same_end(folder / f"memory{number}", reference)
+        yield f"{allowed_mb} MiB {'more ' * (moment != 'at the start')}{moment}", ended
+
+
+PARTS = {part.__name__: part for part in (careless, files, signals, twice, disk, kills, memory)}
 
 
 OPTIONS = {

@@ -222,6 +222,7 @@ def train(**settings: Any) -> Run:
     Raises:
         SettingError: a mistake in the settings, in one line.
         training.DiskError: the run directory cannot be written.
+        training.OutOfMemory: the system gives no more.
     """
     if settings.get("distributed"):
         raise SettingError("distributed: is for the command line, which a run of several processes has to itself")

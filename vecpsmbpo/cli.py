@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from vecpsmbpo import crash
+from vecpsmbpo import crash, limits
 from vecpsmbpo.settings import SettingError, Settings
 
 HELP = """\
@@ -63,6 +63,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         where = f"{error.filename}: " if error.filename else ""
         print(f"vecpsmbpo: {where}{error.strerror or error}", file=sys.stderr)
         return 2
+    except MemoryError:
+        print("vecpsmbpo: out of memory", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:  # before a run heeds signals itself, or a second one
         print("vecpsmbpo: interrupted", file=sys.stderr)
         return 130
@@ -104,8 +107,8 @@ def _train(overrides: list[str]) -> int:
 
 @contextlib.contextmanager
 def _nothing_to_save() -> Iterator[None]:
-    """While JAX is imported: Ctrl-C ends the process at once. As an exception it can be lost in a module that is being
-    imported, which catches everything."""
+    """While JAX is imported, for which there is room: Ctrl-C ends the process at once. As an exception it can be lost
+    in a module that is being imported, which catches everything."""
 
     def leave(number: int, frame: Any) -> None:
         print("vecpsmbpo: interrupted", file=sys.stderr, flush=True)
@@ -115,6 +118,7 @@ def _nothing_to_save() -> Iterator[None]:
     if "jax" in sys.modules or threading.current_thread() is not threading.main_thread():
         yield
         return
+    limits.check_start()
     before = signal.signal(signal.SIGINT, leave)
     try:
         yield
@@ -125,17 +129,18 @@ def _nothing_to_save() -> Iterator[None]:
 def _run(settings: Settings) -> int:
     with _nothing_to_save():
         from vecpsmbpo import processes, runtime
-        from vecpsmbpo.training import DiskError, train
+        from vecpsmbpo.training import DiskError, OutOfMemory, train
 
         runtime.check_flags()
     try:
         return train(settings)
-    except (DiskError, processes.LostProcess, SettingError) as error:
+    except (DiskError, OutOfMemory, processes.LostProcess, SettingError) as error:
         if isinstance(error, SettingError) and not processes.are_several():
             raise
         print(f"vecpsmbpo: {error}", file=sys.stderr, flush=True)
         # Not a plain exit: the writer threads of orbax and tensorboardX would each report the same disk again, in
-        # tracebacks of their own, while the interpreter ends; and JAX would wait for the processes that have left.
+        # tracebacks of their own, while the interpreter ends; there may be no memory for that; and JAX would wait for
+        # the processes that have left.
         crash.end()
         os._exit(1 if isinstance(error, processes.LostProcess) else 2)
 

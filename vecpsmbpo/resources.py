@@ -9,13 +9,13 @@ from typing import Any
 
 import jax
 
-from vecpsmbpo import replay
+from vecpsmbpo import limits, replay
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.layout import MEMBERS, SEEDS, Layout
+from vecpsmbpo.limits import GIB
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import TrainState
 
-GIB = 2**30
 CHECKPOINT_OVERHEAD = 2**20  # orbax's own files
 # Python, JAX and what XLA takes to compile and keeps (measured: hopper at the paper's size held 6.7 GiB at most, of
 # which 4.2 are announced otherwise; 6.0 where the program came from the compilation cache).
@@ -47,11 +47,11 @@ def working_bytes(algorithm: Algorithm) -> int:
 
 
 def available_bytes(layout: Layout) -> int:
-    """Free memory for this process's part of the mesh: of the GPUs, or of this machine (and its control group)."""
+    """Free memory for this process's part of the mesh: of the GPUs, or of this machine (and what it lets us have)."""
     if not _on_cpu(layout):
         stats = [device.memory_stats() or {} for device in layout.mesh.local_devices]
         return sum(s.get("bytes_limit", 0) - s.get("bytes_in_use", 0) for s in stats)
-    return min(_machine_available(), _control_group_available())
+    return min(_machine_available(), _control_group_available(), limits.free_address_space())
 
 
 def _on_cpu(layout: Layout) -> bool:

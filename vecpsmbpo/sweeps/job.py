@@ -64,14 +64,14 @@ def train(run: Run, heeding: AbstractContextManager[Stop]) -> Outcome:
     with heeding as stop:
         try:
             from vecpsmbpo import runtime
-            from vecpsmbpo.training import DiskError
+            from vecpsmbpo.training import DiskError, OutOfMemory
             from vecpsmbpo.training import train as train_here
         except ImportError as error:
             return _failed(1, words.of(error))
         try:
             runtime.check_flags()
             return Outcome(train_here(run.settings, stop))
-        except (SettingError, DiskError) as error:
+        except (SettingError, DiskError, OutOfMemory) as error:
             return _failed(2, str(error))
         except Exception as error:
             traceback.print_exc()

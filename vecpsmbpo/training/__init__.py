@@ -1,6 +1,6 @@
 """Training: the loop around the compiled program, and what stands around that loop."""
 
-from vecpsmbpo.training.guards import DiskError
+from vecpsmbpo.training.guards import DiskError, OutOfMemory
 from vecpsmbpo.training.loop import train
 
-__all__ = ["DiskError", "train"]
+__all__ = ["DiskError", "OutOfMemory", "train"]

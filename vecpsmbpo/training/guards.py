@@ -1,4 +1,4 @@
-"""What stands around a run: the lock on its directory, and a disk that cannot be written."""
+"""What stands around a run: the lock on its directory, a disk that cannot be written, memory that is not given."""
 
 import contextlib
 import errno
@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from vecpsmbpo import words
 from vecpsmbpo.settings import SettingError
 
 try:
@@ -23,6 +24,10 @@ DISK_ERRORS = frozenset(
 
 class DiskError(Exception):
     """The run directory cannot be written; the last checkpoint is whole."""
+
+
+class OutOfMemory(Exception):
+    """The system gave no more memory; the last checkpoint is whole."""
 
 
 @contextlib.contextmanager
@@ -59,3 +64,25 @@ def disk_errors(run_dir: Path) -> Iterator[None]:
     else:
         return
     raise DiskError(f"run_dir={run_dir}: cannot be written ({reason})")
+
+
+@contextlib.contextmanager
+def memory_errors(run_dir: Path) -> Iterator[None]:
+    """Turns memory that is asked for and not given into one line."""
+    try:
+        yield
+    except (MemoryError, SystemError, RuntimeError, OSError) as error:
+        if not _is_out_of_memory(error):
+            raise
+        raise OutOfMemory(
+            f"run_dir={run_dir}: out of memory ({words.of(error)}); what was saved is whole: the same command goes on"
+        ) from None
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Python, its extensions, threads, the system and XLA each have their own way to say it."""
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    if isinstance(error, RuntimeError):  # JAX's errors are of it
+        return any(told in str(error) for told in ("can't start new thread", "RESOURCE_EXHAUSTED", "Out of memory"))
+    return isinstance(error, MemoryError) or "without exception set" in str(error)

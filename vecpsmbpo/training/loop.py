@@ -30,7 +30,7 @@ from vecpsmbpo.look import report
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.stopping import Stop, heeding_signals
-from vecpsmbpo.training.guards import alone_in, disk_errors
+from vecpsmbpo.training.guards import alone_in, disk_errors, memory_errors
 from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
@@ -51,11 +51,12 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
         SettingError: it cannot be run as asked (`resources.check_memory`, `envs.make`), or not be gone on with. Nothing
             has been changed then.
         DiskError: the run directory cannot be written.
+        OutOfMemory: the system gives no more.
         LostProcess: another process of the run is gone.
     """
     runtime.configure(settings)
     run_dir = Path(settings.run_dir)
-    with processes.noticing_the_lost(), contextlib.ExitStack() as around:
+    with processes.noticing_the_lost(), memory_errors(run_dir), contextlib.ExitStack() as around:
         processes.check_same(settings)
         with processes.together():
             driver = make_driver(settings)
