@@ -45,8 +45,6 @@ def test_other_errors_stay_what_they_are(error, tmp_path):
 
 
 def test_free_address_space_is_the_limit_less_what_is_taken(monkeypatch):
-    assert limits.free_address_space() == 2**63 or resource.getrlimit(resource.RLIMIT_AS)[0] > 0
-    taken = 2**63 - 1
     with open("/proc/self/status") as file:
         taken = next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmSize"))
     monkeypatch.setattr(resource, "getrlimit", lambda which: (taken + 2**30, taken + 2**30))
@@ -59,9 +57,8 @@ def test_free_address_space_is_the_limit_less_what_is_taken(monkeypatch):
 def test_a_limit_on_address_space_is_one_line_before_anything_is_made(limit_mb, line, tmp_path):
     """With 900 MiB OpenBLAS would ask for memory again for ever."""
     limited = f"ulimit -v {limit_mb * 1024}; exec {sys.executable} -m vecpsmbpo.cli train size=tiny backend=host"
-    result = subprocess.run(
-        ["bash", "-c", limited], cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=120, check=False
-    )
+    shell = ["bash", "-c", limited]
+    result = subprocess.run(shell, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith(f"vecpsmbpo: {line}")
     assert result.stderr.count("\n") == 1

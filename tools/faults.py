@@ -76,7 +76,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def one_line(status: int, errors: str, expected: int | None = 2) -> str:
-    """`expected`: the exit status; None is any but 0, since the system says how a process ends that it takes memory from."""
+    """`expected`: the exit status; None is any but 0: how a process ends that gets no memory, the system says."""
     if expected is None:
         expected = status or 1
     told = [line for line in errors.splitlines() if line.startswith("vecpsmbpo: ") and "warning" not in line]

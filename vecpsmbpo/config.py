@@ -18,7 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from vecpsmbpo import loggers, recorded
+from vecpsmbpo import loggers, recorded, whole
 from vecpsmbpo.algorithms.catalogue import FIELDS, allowed, build, check, check_sweep, require
 from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import CHANGEABLE, SettingError, Settings
@@ -222,10 +222,9 @@ def _default_run_dir(settings: Settings, overrides: Sequence[str]) -> str:
 
 def save(settings: Settings, run_dir: Path) -> None:
     """Writes `config.yaml`: not with whom it was run, which is over when it ends."""
-    beside = run_dir / f"{CONFIG_FILE}.tmp"
     plain = recorded.plain(dataclasses.replace(settings, distributed=""))
-    beside.write_text(yaml.safe_dump(plain, sort_keys=False))
-    beside.replace(run_dir / CONFIG_FILE)  # at once: a run whose config is cut short could not be resumed
+    # At once: a run whose config is cut short could not be resumed.
+    whole.write_text(run_dir / CONFIG_FILE, yaml.safe_dump(plain, sort_keys=False))
 
 
 def load(run_dir: str | Path) -> Settings:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from vecpsmbpo import whole
 from vecpsmbpo.settings import SettingError, Settings
 
 PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
@@ -87,7 +88,7 @@ class Loggers:
         return Remote(
             lambda: kinds[name](settings, self._run_dir, env_steps),
             lambda error: self._drop(name, error),
-            lambda env_steps: _store(path, str(env_steps)),
+            lambda env_steps: whole.write_text(path, str(env_steps)),
         )
 
     def scalars(self, values: Values, env_steps: int) -> None:
@@ -286,7 +287,7 @@ def _id(run_dir: Path, name: str, make: Callable[[], str]) -> str:
     """What the run is called at a logger's server: the same in every session."""
     path = run_dir / IDS.format(name)
     if not path.exists():
-        _store(path, make())
+        whole.write_text(path, make())
     return path.read_text().strip()
 
 
@@ -296,9 +297,3 @@ def _reached(run_dir: Path, name: str, logged: int) -> int:
         return 0
     path = run_dir / SENT.format(name)
     return min(logged, int(path.read_text())) if path.exists() else logged
-
-
-def _store(path: Path, text: str) -> None:
-    beside = path.with_name(f"{path.name}.tmp")
-    beside.write_text(text)
-    beside.replace(path)

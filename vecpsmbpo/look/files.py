@@ -1,27 +1,24 @@
-"""Files that are whole or not there."""
+"""What a command writes where it was told to: whole, or one line."""
 
 import os
 from collections.abc import Callable
 from pathlib import Path
 
+from vecpsmbpo import whole
 from vecpsmbpo.settings import SettingError
 
 
 def write(path: Path, make: Callable[[Path], object]) -> None:
-    """Has `make` write a file beside `path`, of the same kind, and moves it there.
+    """As `whole.write`, in a directory that is made for it.
 
     Raises:
         SettingError: it cannot be written; what stood at `path` is as it was.
     """
-    beside = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        make(beside)
-        beside.replace(path)
+        whole.write(path, make)
     except OSError as error:
         raise SettingError(f"out={path}: cannot be written ({error.strerror or error})") from None
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
