@@ -352,6 +352,15 @@ def test_a_run_of_a_grid_that_cannot_be_is_one_line_and_the_others_go_on(tmp_pat
     assert [run.name[-9:] for run in (tmp_path / "runs").iterdir() if run.is_dir()] == ["n_models1"]
 
 
+def test_a_run_of_a_grid_that_cannot_be_written_does_not_take_the_others_with_it(tmp_path):
+    (tmp_path / "file").touch()
+    small = ["env=ball_in_cup", "backend=host", "size=tiny", "total_steps=40", "loggers=[]"]
+    result = command("train", "-m", *small, "run_dir=file/run,whole", cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.splitlines() == ["vecpsmbpo: run_dir=file/run: cannot be written (Not a directory)"]
+    assert (tmp_path / "whole" / "metrics.jsonl").read_text().count("\n") == 1
+
+
 def test_swept_values_are_kept_with_the_run(tmp_path):
     settings = config.compose(["size=tiny", "num_seeds=2", "seed=5", "sweep.temperature=[1,.inf]"])
     assert [tuple(lane.values()) for lane in settings.lanes] == [(5, 1.0), (6, 1.0), (5, math.inf), (6, math.inf)]

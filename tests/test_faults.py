@@ -1,5 +1,6 @@
 """What careless commands, surroundings and tasks do: one line each. In this process, where nothing has to start."""
 
+import contextlib
 import io
 import os
 import re
@@ -11,6 +12,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 from tests.helpers import command, environment, tiny
 from vecpsmbpo import cli, config, envs, runtime, stopping, words
@@ -213,3 +215,18 @@ def test_control_c_is_not_lost_in_an_import(tmp_path):
     arguments = [sys.executable, "-c", program]
     result = subprocess.run(arguments, env=environment(), capture_output=True, text=True, timeout=60)
     assert (result.returncode, result.stderr) == (130, "vecpsmbpo: interrupted\n")
+
+
+def test_a_reader_that_is_gone_does_not_stop_what_is_printed_to_it(monkeypatch):
+    """`vecpsmbpo train | head`, and a terminal that was closed."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    unheard: list[str] = []
+    monkeypatch.setattr(stopping, "_speak_to_nobody", lambda: unheard.append("gone"))
+    with open(writing, "w", buffering=1) as pipe:
+        console = Console(file=stopping.Outliving(pipe))
+        console.print("a line")
+        console.print("another")
+        assert unheard
+        with contextlib.suppress(BrokenPipeError):  # what is left in its buffer
+            pipe.close()

@@ -151,6 +151,16 @@ def test_a_connection_that_hangs_holds_nothing_up(tmp_path, recorder, monkeypatc
     assert said == ["loggers: the run goes on without wandb (it did not answer for 0.1 s)"]
 
 
+@pytest.mark.parametrize("text", ["", "\x00\x00", "forty"])
+def test_a_damaged_note_of_what_was_sent_counts_as_all_that_was_logged(text, tmp_path):
+    assert loggers._reached(tmp_path, "wandb", 80) == 0  # a new one
+    (tmp_path / loggers.IDS.format("wandb")).write_text("abc")
+    (tmp_path / loggers.SENT.format("wandb")).write_text("40")
+    assert loggers._reached(tmp_path, "wandb", 80) == 40
+    (tmp_path / loggers.SENT.format("wandb")).write_text(text)
+    assert loggers._reached(tmp_path, "wandb", 80) == 80
+
+
 def test_hyperparameters_have_the_names_of_the_command_line():
     settings = config.compose(["size=tiny", "env=gymnasium", "env.id=Hopper-v5", "sweep.real_ratio=[0,1]"])
     found = loggers.hyperparameters(settings)

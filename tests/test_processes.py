@@ -11,6 +11,8 @@ import pytest
 from tests.helpers import argv, environment
 from tests.test_resume import without_times
 from vecpsmbpo import cli, jsonl, processes
+from vecpsmbpo.drivers import host
+from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.settings import SettingError
 
 RUN = ("train", "size=tiny", "loggers=[]")
@@ -150,3 +152,18 @@ def test_a_grid_is_not_one_run(tmp_path, monkeypatch, capsys):
 def test_an_address_that_is_none(wrong):
     with pytest.raises(SettingError, match=r"^distributed=.*: must be auto, or host:port/index/processes"):
         processes.join(wrong)
+
+
+@pytest.mark.parametrize("here", [True, False])
+def test_a_simulator_that_fails_in_one_process_fails_in_all(here, monkeypatch):
+    class Failing:
+        def step(self, action):
+            if here:
+                raise SimulatorError("out of coal")
+            return "a step"
+
+    if not here:
+        assert host._step_in_all(Failing(), None) == "a step"
+    monkeypatch.setattr(processes, "greatest", lambda failed: 1)
+    with pytest.raises(SimulatorError, match="out of coal" if here else "failed in another process"):
+        host._step_in_all(Failing(), None)

@@ -1,8 +1,9 @@
 """The whole run on disk, through orbax: a resumed run is the run."""
 
-import errno
 import json
 import logging
+import os
+import traceback
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +17,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import type_handlers
 
-from vecpsmbpo import placement, processes, recorded
+from vecpsmbpo import placement, processes, recorded, shortages
 from vecpsmbpo.algorithms import TABLE
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import SettingError, Settings
@@ -24,9 +25,23 @@ from vecpsmbpo.types import TrainState
 
 _log = logging.getLogger(__name__)
 FOLDER = "checkpoints"  # in the run directory
-SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # of the system, and no damage
 IN_FLIGHT_GB = 0.2  # being written or read at a time
 CHUNK_BYTES = 32 * 2**20  # of one file
+
+
+class _OrbaxIsQuiet(logging.Filter):
+    """Drops what orbax tells of every file that it cannot read or write, beside the error that it raises: through
+    absl's logger and, where its tasks are given up, through asyncio's, which are also other people's."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        frames = traceback.walk_tb(record.exc_info[2]) if record.exc_info else ()
+        files = [record.pathname, *(frame.f_code.co_filename for frame, _ in frames)]
+        return not any("orbax" in file or "tensorstore" in file for file in files)
+
+
+for _name in ("absl", "asyncio"):
+    logging.getLogger(_name).addFilter(_OrbaxIsQuiet())
+logging.getLogger("orbax").setLevel(logging.CRITICAL)
 
 
 class Saved(NamedTuple):
@@ -56,8 +71,6 @@ class Checkpoints:
         self._directory, self._settings = directory, settings
         self._format = TABLE[settings.algo].format
         self._damaged: list[int] = []
-        for name in ("absl", "orbax", "asyncio"):  # which tell of every file that cannot be read, beside the error
-            logging.getLogger(name).setLevel(logging.CRITICAL)
         read_only = read_only or not processes.is_first()
         several = processes.are_several()
         if several and not read_only:
@@ -126,6 +139,7 @@ class Checkpoints:
         Raises:
             SettingError: there are checkpoints, and none can be read; or they are of other settings, or of an older
                 version of this program.
+            OSError: the system does not let it be read (`shortages`), which says nothing of what it holds.
         """
         reason: Exception | None = None
         for step in reversed(self.steps()):
@@ -133,11 +147,11 @@ class Checkpoints:
                 continue
             try:
                 items = self._read(step, shapes, layout)
-            except (MemoryError, SettingError):
+            except SettingError:
                 raise
             except Exception as error:  # whatever a damaged file makes orbax raise
-                if isinstance(error, OSError) and error.errno in SHORTAGES:
-                    raise
+                if (number := shortages.number_of(error)) in shortages.NOT_READ:  # it may be whole all the same
+                    raise OSError(number, os.strerror(number), str(self._directory / str(step))) from error
                 _log.debug("checkpoint %d", step, exc_info=error)
                 warn(f"the checkpoint at step {step} is damaged; taking the one before it")
                 reason = error

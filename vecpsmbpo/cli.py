@@ -9,7 +9,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from vecpsmbpo import crash, limits
 from vecpsmbpo.settings import SettingError, Settings
@@ -102,7 +102,8 @@ def _dispatch(arguments: list[str]) -> int:
 def _train(overrides: list[str]) -> int:
     from vecpsmbpo import config
 
-    return _run(config.resolve(overrides))
+    status, in_order = _run(config.resolve(overrides))
+    return status if in_order else _leave(status)
 
 
 @contextlib.contextmanager
@@ -126,23 +127,28 @@ def _nothing_to_save() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _run(settings: Settings) -> int:
+def _run(settings: Settings) -> tuple[int, bool]:
+    """Trains; the exit status, and whether the process may end as processes do."""
     with _nothing_to_save():
         from vecpsmbpo import processes, runtime
         from vecpsmbpo.training import DiskError, OutOfMemory, train
 
         runtime.check_flags()
     try:
-        return train(settings)
+        return train(settings), True
     except (DiskError, OutOfMemory, processes.LostProcess, SettingError) as error:
         if isinstance(error, SettingError) and not processes.are_several():
             raise
         print(f"vecpsmbpo: {error}", file=sys.stderr, flush=True)
-        # Not a plain exit: the writer threads of orbax and tensorboardX would each report the same disk again, in
-        # tracebacks of their own, while the interpreter ends; there may be no memory for that; and JAX would wait for
-        # the processes that have left.
-        crash.end()
-        os._exit(1 if isinstance(error, processes.LostProcess) else 2)
+        return (1 if isinstance(error, processes.LostProcess) else 2), False
+
+
+def _leave(status: int) -> NoReturn:
+    """Ends the process at once: the writer threads of orbax and tensorboardX would each report the same disk again, in
+    tracebacks of their own, while the interpreter ends; there may be no memory for that; and JAX would wait for the
+    processes that have left."""
+    crash.end()
+    os._exit(status)
 
 
 class _Task:
@@ -150,10 +156,11 @@ class _Task:
 
     Attributes:
         worst: the exit status of all runs so far, those of a launcher (`hydra_plugins.vecpsmbpo`) included.
+        in_order: whether the process may end as processes do.
     """
 
     def __init__(self) -> None:
-        self.worst = 0
+        self.worst, self.in_order = 0, True
 
     def __call__(self, tree: Any) -> None:
         from hydra.core.hydra_config import HydraConfig
@@ -161,7 +168,8 @@ class _Task:
         from vecpsmbpo import config
 
         try:
-            status = _run(config.resolve(list(HydraConfig.get().overrides.task), tree))
+            status, in_order = _run(config.resolve(list(HydraConfig.get().overrides.task), tree))
+            self.in_order &= in_order
         except SettingError as error:
             print(f"vecpsmbpo: {error}", file=sys.stderr)
             status = 2
@@ -198,7 +206,7 @@ def _multirun(overrides: list[str]) -> int:
     except Elsewhere as error:
         print(f"vecpsmbpo: {error}", file=sys.stderr)
         return 130
-    return task.worst
+    return task.worst if task.in_order else _leave(task.worst)
 
 
 def _eval(rest: list[str]) -> int:

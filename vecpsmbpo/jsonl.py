@@ -132,6 +132,8 @@ class Growing:
                 rewound.writelines(kept)
                 self._count(kept)
                 before += len(batch)
+            rewound.flush()
+            os.fsync(rewound.fileno())  # or it would be empty, where power fails just after it was moved
         if strange:  # before they are gone from where they were
             with self._aside.open("ab") as file:
                 file.writelines(strange)

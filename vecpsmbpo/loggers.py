@@ -286,14 +286,16 @@ def hyperparameters(settings: Settings) -> dict[str, Any]:
 def _id(run_dir: Path, name: str, make: Callable[[], str]) -> str:
     """What the run is called at a logger's server: the same in every session."""
     path = run_dir / IDS.format(name)
-    if not path.exists():
+    if not path.exists() or not path.stat().st_size:
         whole.write_text(path, make())
-    return path.read_text().strip()
+    return path.read_text(errors="replace").strip()
 
 
 def _reached(run_dir: Path, name: str, logged: int) -> int:
     """Steps up to which a logger has been told everything, of those that were `logged`; 0 for one that is new."""
     if not (run_dir / IDS.format(name)).exists():
         return 0
-    path = run_dir / SENT.format(name)
-    return min(logged, int(path.read_text())) if path.exists() else logged
+    try:
+        return min(logged, int((run_dir / SENT.format(name)).read_text()))
+    except (OSError, ValueError):  # not there, or damaged: only what a kill kept from reaching it is missing then
+        return logged

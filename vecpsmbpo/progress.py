@@ -1,14 +1,16 @@
 """What a person sees of a run: a live line in a terminal, plain lines elsewhere."""
 
+import sys
 import time
 from collections import deque
 from types import TracebackType
-from typing import NamedTuple
+from typing import NamedTuple, TextIO, cast
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from vecpsmbpo import stopping
 from vecpsmbpo.algorithms.base import Algorithm
 
 PLAIN_LINE_EVERY_S = 30.0  # where there is no terminal, besides the one at the end of each epoch
@@ -19,7 +21,8 @@ class Display:
 
     def __init__(self, algorithm: Algorithm, env_steps: int, console: Console | None = None):
         settings = self._settings = algorithm.settings
-        self._console = console or Console(highlight=False, soft_wrap=True)
+        outliving = cast(TextIO, stopping.Outliving(sys.stdout))
+        self._console = console or Console(file=outliving, highlight=False, soft_wrap=True)
         self._eval_return: float | None = None
         self._train_return: float | None = None
         self._pace = Pace(algorithm)

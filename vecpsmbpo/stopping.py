@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 Handler = Callable[[int, FrameType | None], Any]
 FINISHING = "finishing this chunk and saving; once more to stop at once"
@@ -88,9 +88,33 @@ def _handling(handlers: Mapping[int, Handler]) -> Iterator[None]:
 
 
 def _say(words: str) -> None:
+    print(f"\n{words}", file=Outliving(sys.stderr), flush=True)
+
+
+class Outliving:
+    """A stream whose terminal or pipe may be gone, which must not take the run with it."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with _unheard():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with _unheard():
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def _unheard() -> Iterator[None]:
     try:
-        print(f"\n{words}", file=sys.stderr, flush=True)
-    except OSError:  # the terminal is gone, and must not take the run with it
+        yield
+    except OSError:
         _speak_to_nobody()
 
 

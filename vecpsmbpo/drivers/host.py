@@ -1,6 +1,7 @@
 """Simulators on the host: the functions of the algorithm, jitted one by one, with a simulator stepped between them."""
 
 import itertools
+import zlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -21,10 +22,10 @@ from vecpsmbpo.drivers.common import (
     evaluation_policies,
     split_for_episodes,
 )
-from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
+from vecpsmbpo.envs.host.batched import HostEnv, HostStep, SimulatorError
 from vecpsmbpo.layout import BY_SEED, SHARED
 from vecpsmbpo.schedule import begin_stride, observe_and_learn, over_seeds, split_keys
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
 
 
@@ -113,12 +114,25 @@ class HostDriver:
             ends, frozen = jax.tree.map(np.asarray, processes.here((ends, frozen)))
             news += [end.replace(done=end.done & ~frozen) for end in ends]
         self._saved_env = None
+        self._check_alike()
         return state, _stacked(news)
+
+    def _check_alike(self) -> None:
+        """Every process steps simulators of its own, and feeds its devices what it has seen.
+
+        Raises:
+            SettingError: they have not seen the same.
+        """
+        if processes.are_several() and not processes.agree(zlib.crc32(repr(self._env.save()).encode()) & 0x7FFFFFFF):
+            raise SettingError(
+                f"distributed: the simulators of {self.settings.task} are not in the same state in all processes: they "
+                "depend on more than their seeds and actions"
+            )
 
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
         obs = state.env
         action, memory, key, keys = self._act(state.counters, state.seeds, obs)
-        step = self._env.step(np.asarray(processes.here(action)))
+        step = _step_in_all(self._env, np.asarray(processes.here(action)))
         seen = (step.reward, step.next_obs, step.terminated.astype(np.float32), step.truncated, step.obs)
         reward, next_obs, terminated, truncated, following = self.layout.everywhere(seen, BY_SEED)
         transition = Transition(obs, action, reward, next_obs, terminated)
@@ -144,7 +158,7 @@ class HostDriver:
             states = self.layout.everywhere(obs.reshape(seeds, episodes, obs_size), BY_SEED)
             now = self.layout.everywhere(jnp.int32(t), SHARED)
             action, memory = act(policies, now, memory, states, split.actions)
-            step = env.step(np.asarray(processes.here(action)).reshape(count, -1))
+            step = _step_in_all(env, np.asarray(processes.here(action)).reshape(count, -1))
             obs = step.obs
             total += np.where(alive & step.sound, step.reward, 0.0)
             length += alive
@@ -189,6 +203,22 @@ class HostDriver:
             self.algorithm, state.counters, seeds, transition, truncated, keys, learning
         )
         return TrainState(counters, seeds, obs), end
+
+
+def _step_in_all(env: HostEnv, action: np.ndarray) -> HostStep:
+    """A step of the simulators, which fails in all processes of the run where it fails in one.
+
+    Raises:
+        SimulatorError: it has failed here, or in another one.
+    """
+    failed: SimulatorError | None = None
+    try:
+        step = env.step(action)
+    except SimulatorError as error:
+        failed = error
+    if processes.greatest(int(failed is not None)):
+        raise failed or SimulatorError("its simulator failed in another process of the run, which says how")
+    return step
 
 
 def _stacked(news: list[EpisodeEnd]) -> Any:

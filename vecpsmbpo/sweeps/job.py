@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
-from vecpsmbpo import words
+from vecpsmbpo import limits, words
 from vecpsmbpo.jsonl import METRICS_FILE
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.stopping import Stop
@@ -63,11 +63,14 @@ def train(run: Run, heeding: AbstractContextManager[Stop]) -> Outcome:
     os.chdir(run.folder)
     with heeding as stop:
         try:
+            limits.check_start()
             from vecpsmbpo import runtime
             from vecpsmbpo.training import DiskError, OutOfMemory
             from vecpsmbpo.training import train as train_here
         except ImportError as error:
             return _failed(1, words.of(error))
+        except SettingError as error:
+            return _failed(2, str(error))
         try:
             runtime.check_flags()
             return Outcome(train_here(run.settings, stop))

@@ -6,20 +6,13 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from vecpsmbpo import words
+from vecpsmbpo import shortages, words
 from vecpsmbpo.settings import SettingError
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
-
-# What the operating system says where a file cannot be written.
-DISK_ERRORS = frozenset(
-    {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
-    | {errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG}
-    | {errno.ENOENT, errno.EMFILE, errno.ENFILE}
-)
 
 
 class DiskError(Exception):
@@ -50,20 +43,14 @@ def alone_in(run_dir: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def disk_errors(run_dir: Path) -> Iterator[None]:
-    """Turns a disk that cannot be written into one line."""
+    """Turns a disk that cannot be read or written into one line."""
     try:
         yield
-    except OSError as error:
-        if error.errno not in DISK_ERRORS:
+    except (OSError, ValueError) as error:
+        number = shortages.number_of(error)
+        if number not in shortages.OF_DISKS:
             raise
-        reason = os.strerror(error.errno)
-    except ValueError as error:  # orbax's storage layer reports a full disk so
-        if "No space left" not in str(error) and "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        reason = os.strerror(errno.ENOSPC)
-    else:
-        return
-    raise DiskError(f"run_dir={run_dir}: cannot be written ({reason})")
+        raise DiskError(f"run_dir={run_dir}: cannot be written ({os.strerror(number)})") from None
 
 
 @contextlib.contextmanager
@@ -71,18 +58,9 @@ def memory_errors(run_dir: Path) -> Iterator[None]:
     """Turns memory that is asked for and not given into one line."""
     try:
         yield
-    except (MemoryError, SystemError, RuntimeError, OSError) as error:
-        if not _is_out_of_memory(error):
+    except Exception as error:
+        if shortages.number_of(error) != errno.ENOMEM:
             raise
         raise OutOfMemory(
             f"run_dir={run_dir}: out of memory ({words.of(error)}); what was saved is whole: the same command goes on"
         ) from None
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """Python, its extensions, threads, the system and XLA each have their own way to say it."""
-    if isinstance(error, OSError):
-        return error.errno == errno.ENOMEM
-    if isinstance(error, RuntimeError):  # JAX's errors are of it
-        return any(told in str(error) for told in ("can't start new thread", "RESOURCE_EXHAUSTED", "Out of memory"))
-    return isinstance(error, MemoryError) or "without exception set" in str(error)

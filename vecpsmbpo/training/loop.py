@@ -35,7 +35,8 @@ from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_dr
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
 # An epoch that takes longer than this is run in chunks of about half of it, to show progress and to heed signals.
-LONG_EPOCH_S = 20.0
+# Whoever sends SIGTERM may kill after ten seconds.
+LONG_EPOCH_S = 8.0
 
 
 def train(settings: Settings, stop: Stop | None = None) -> int:
@@ -69,7 +70,7 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
                 around.enter_context(alone_in(run_dir))
             _check_not_emptied(run_dir)
         stop = around.enter_context(heeding_signals()) if stop is None else stop
-        crash.doing("making the first state", run_dir)
+        crash.doing(_among("making the first state"), run_dir)
         status = _Session(settings, driver, shapes, memory).go(stop)
         processes.greatest(0)  # whoever left before the first has written its last would take it along
         return status
@@ -169,9 +170,9 @@ class _Session:
     def _compile(self) -> None:
         cached = "; the compilation cache makes this short next time" if self.settings.compile_cache else ""
         self.display.say(f"compiling the training program{cached} …")
-        crash.doing("compiling the training program")
+        crash.doing(_among("compiling the training program"))
         self.driver.compile(self.state)
-        crash.doing("training" + (crash.BESIDE_OTHERS if self.settings.distributed else ""))
+        crash.doing(_among("training"))
         self.display.say(f"compiled in {self.driver.compile_seconds:.1f} s")
 
     def _chunk(self) -> None:
@@ -340,6 +341,11 @@ class _Session:
         if self.settings.distributed:
             return "the same command again, in every process"
         return f"vecpsmbpo train {shlex.quote(config.as_override('run_dir', self.run_dir))}"
+
+
+def _among(doing: str) -> str:
+    """With the other processes of the run, if there are any: a crash may be theirs."""
+    return doing + (crash.BESIDE_OTHERS if processes.are_several() else "")
 
 
 def _check_not_emptied(run_dir: Path) -> None:
