@@ -67,6 +67,7 @@ COMMANDS: list[tuple[list[str], dict[str, str]]] = [
     ),
     *((SMALL, {"JAX_PLATFORMS": wrong}) for wrong in ("foo", "cuda", "tpu")),
     (SMALL, {"XLA_FLAGS": "--xla_nosuch=1"}),
+    (["train", "env=hoppér", "run_dir=λ"], {"PYTHONIOENCODING": "ascii"}),
     *(
         (words.split(), {})
         for words in ("trian", "eval", "eval run_dir=nowhere", "plot nowhere", "report", "envs x", "figure fig99")

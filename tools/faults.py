@@ -4,14 +4,17 @@
     tools/faults part=careless,files           some
     tools/faults part=kills kills=20           fewer kills
 
-Each part replaces its own rows of results/faults.csv. Parts:
+Each part replaces its own rows of results/faults.csv, which say how it ended: the same end as undisturbed, the same
+state with log lines that are lost and said to be, one line that says what is wrong, or the fault. Parts:
     careless    commands and tasks with a mistake: one line, exit status 2, nothing created
     files       each file of a run directory truncated, emptied, replaced by noise, one bit flipped; then gone on with
-    signals     SIGINT, SIGTERM, SIGHUP: saved within 10 s of the chunk, and gone on with
+    signals     SIGINT, SIGTERM, SIGHUP, and kill -9 ten seconds later; then gone on with
     twice       a second process in the directory of a run
-    disk        disks of many sizes, which fill up in one write or another; then made larger, and gone on with
-    kills       kill -9 at random moments until the run is complete
-    memory      limits on address space, from the start, while compiling and while training; then gone on without
+    disk        disks of many sizes and numbers of files, which fill up in one write or another; then made larger, and
+                gone on with (mounts them, so needs root)
+    kills       kill -9 at random moments, one of five while a checkpoint is written, until the run is complete
+    limits      of address space, from the start, while compiling and while training, and of open files; then gone on
+                with as without (a process that C++ ends may say that, too, beside the one line)
 """
 
 import contextlib
@@ -34,20 +37,22 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.helpers import argv, environment
 from tools.careless import COMMANDS, MODULES
-from vecpsmbpo import arguments, cli, jsonl
+from vecpsmbpo import arguments, checkpoint, cli, jsonl
 from vecpsmbpo.settings import SettingError
 
 OUT = Path("results/faults.csv")
 RUN = ["size=tiny", "env=ball_in_cup", "loggers=[]"]  # 40 steps an epoch, a checkpoint each
 STOPPED, END = 120, 160
-SAVED_WITHIN_S = 10.0
+TO_LIVE_S = 10.0
 ANSWER_S = 100
 MEMORIES_MB = (200, 600, 1000, 1800, 2600, 3400, 4200, 5000)
 MORE_MB = (0, 1, 4, 16, 64, 128, 256)  # than it holds
+OPEN_FILES = (8, 16, 24, 32, 48, 64, 96, 128, 256)
 DISKS_KB = (64, 400, 800, 1100, 1200, 1300, 1400, 1600, 1800, 2000, 2200, 2400, 2600)
+DISKS_FILES = (3, 20, 40, 60, 80, 100, 120, 140, 160, 200)
 Found = tuple[str, str]  # what was tried, and how it ended: FINE or what was wrong
-SAME, ONE_LINE = "same end", "one line"
-FINE = (SAME, ONE_LINE)
+SAME, SAID, ONE_LINE = "same end", "same state, lost lines are said", "one line"
+FINE = (SAME, SAID, ONE_LINE)
 
 
 # ── what a run has come to ───────────────────────────────────────────────────────────────────────────────────────
@@ -60,12 +65,15 @@ def lines(run_dir: Path) -> list[dict]:
     return [{k: v for k, v in line.items() if k not in clock} for name in files for line in jsonl.read(run_dir / name)]
 
 
-def arrays(run_dir: Path) -> int:
-    """A checksum of the whole state at the end."""
-    return json.loads((run_dir / f"checkpoints/{END}/host/metadata").read_text())["arrays"]
+def arrays(run_dir: Path) -> int | None:
+    """A checksum of the whole state at the end; None where it has not come to its end."""
+    metadata = run_dir / f"checkpoints/{END}/host/metadata"
+    return json.loads(metadata.read_text())["arrays"] if metadata.exists() else None
 
 
 def same_end(run_dir: Path, undisturbed: Path) -> str:
+    if arrays(run_dir) is None:
+        return "not gone on with"
     if arrays(run_dir) != arrays(undisturbed):
         return "another end"
     return SAME if lines(run_dir) == lines(undisturbed) else "other logs"
@@ -105,12 +113,17 @@ def command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess:
     return subprocess.CompletedProcess(arguments, process.returncode, said, errors)
 
 
-def started(*arguments: str, cwd: Path, memory_mb: int | None = None) -> subprocess.Popen:
+def started(*arguments: str, cwd: Path, limit: tuple[int, int] | None = None) -> subprocess.Popen:
+    """`limit`: a resource, and how much of it the process may have."""
     pipe, train = subprocess.PIPE, argv("train", *arguments, one_thread=True)
-    limit = None
-    if memory_mb:
-        limit = partial(resource.setrlimit, resource.RLIMIT_AS, (memory_mb << 20, memory_mb << 20))
-    return subprocess.Popen(train, cwd=cwd, env=environment(), stdout=pipe, stderr=pipe, text=True, preexec_fn=limit)
+    obey = partial(resource.setrlimit, limit[0], (limit[1],) * 2) if limit else None
+    return subprocess.Popen(train, cwd=cwd, env=environment(), stdout=pipe, stderr=pipe, text=True, preexec_fn=obey)
+
+
+def said_until(process: subprocess.Popen, word: str) -> None:
+    """Waits until a process has begun a line with `word`, or ended."""
+    assert process.stdout is not None
+    next((line for line in process.stdout if line.startswith(word)), None)
 
 
 def undisturbed(folder: Path, backend: str) -> Path:
@@ -159,7 +172,7 @@ def files(folder: Path, options: dict) -> Iterator[Found]:
         if status == 0:
             ended = same_end(damaged, reference)
             if ended == "other logs" and any(told in said for told in ("set aside", "are lost", "not as they were")):
-                ended = SAME  # and what is lost is said
+                ended = SAID
         else:
             ended = one_line(status, said) if contents(damaged) == before else "it has been changed"
         yield f"{which} {damage}", ended
@@ -196,22 +209,24 @@ def signals(folder: Path, options: dict) -> Iterator[Found]:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         name = signal.Signals(number).name
         process = started(*RUN, "backend=host", f"total_steps={END}", f"run_dir={name}", cwd=folder)
-        next(line for line in process.stdout if line.startswith("step"))
+        said_until(process, "step")
         process.send_signal(number)
-        began = time.perf_counter()
-        said, errors = process.communicate()
-        seconds = time.perf_counter() - began
-        if process.returncode != 128 + number or seconds > SAVED_WITHIN_S or "to continue: " not in said:
-            yield name, f"status {process.returncode} after {seconds:.0f} s: {errors[-200:]!r}"
-            continue
+        try:
+            said, errors = process.communicate(timeout=TO_LIVE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            said, errors = process.communicate()
         command(f"run_dir={name}", cwd=folder)
-        yield name, same_end(folder / name, reference)
+        ended = same_end(folder / name, reference)
+        if process.returncode != 128 + number or "to continue: " not in said:
+            ended = f"{ended}, but status {process.returncode}: {errors[-200:]!r}"
+        yield f"{name}, killed {TO_LIVE_S:.0f} s later", ended
 
 
 def twice(folder: Path, options: dict) -> Iterator[Found]:
     arguments = (*RUN, "backend=host", f"total_steps={END}", "run_dir=run")
     first = started(*arguments, cwd=folder)
-    next(line for line in first.stdout if line.startswith("compiling"))
+    said_until(first, "compiling")
     first.send_signal(signal.SIGSTOP)
     second = command(*arguments, cwd=folder)
     first.send_signal(signal.SIGCONT)
@@ -223,19 +238,21 @@ def twice(folder: Path, options: dict) -> Iterator[Found]:
 def disk(folder: Path, options: dict) -> Iterator[Found]:
     reference, small = undisturbed(folder, "host"), folder / "disk"
     small.mkdir()
-    for size in DISKS_KB:
-        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", small], check=True)
+    kinds = [(f"size={size}k", f"{size} KiB") for size in DISKS_KB]
+    kinds += [(f"size=64m,nr_inodes={files}", f"{files} files") for files in DISKS_FILES]
+    for limits, what in kinds:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", limits, "tmpfs", small], check=True)
         try:
             arguments = (*RUN, "backend=host", f"total_steps={END}", "run_dir=disk/run")
             result = command(*arguments, cwd=folder)
             ended = SAME if result.returncode == 0 else one_line(result.returncode, result.stderr)
             if ended in FINE:
-                subprocess.run(["mount", "-o", "remount,size=64m", small], check=True)
+                subprocess.run(["mount", "-o", "remount,size=64m,nr_inodes=10k", small], check=True)
                 command(*arguments, cwd=folder)
                 ended = same_end(small / "run", reference)
         finally:
             subprocess.run(["umount", small], check=True)
-        yield f"{size} KiB", ended
+        yield what, ended
 
 
 def kills(folder: Path, options: dict) -> Iterator[Found]:
@@ -246,32 +263,52 @@ def kills(folder: Path, options: dict) -> Iterator[Found]:
         longest, done, runs = time.perf_counter() - began, 0, 0
         while done < options["kills"]:
             runs += 1
-            run_dir, before = f"{backend}{runs}", done
+            run_dir, before, saving = folder / f"{backend}{runs}", done, 0
             while True:
                 process = started(*RUN, f"backend={backend}", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
-                try:
-                    process.communicate(timeout=dice.uniform(0, longest) if done < options["kills"] else None)
-                    break
-                except subprocess.TimeoutExpired:
-                    process.kill()
+                if done == options["kills"]:
                     process.communicate()
-                    done += 1
-            yield f"{backend}: {done - before} kills of run {runs}", same_end(folder / run_dir, reference)
+                    break
+                if done % 5 == 0 and in_a_save(process, run_dir):
+                    saving += 1
+                else:
+                    try:
+                        process.communicate(timeout=dice.uniform(0, longest))
+                        break
+                    except subprocess.TimeoutExpired:
+                        pass
+                process.kill()
+                process.communicate()
+                done += 1
+            what = f"{backend}: {done - before} kills of run {runs}, {saving} of them in a save"
+            yield what, same_end(run_dir, reference)
 
 
-def memory(folder: Path, options: dict) -> Iterator[Found]:
+def in_a_save(process: subprocess.Popen, run_dir: Path) -> bool:
+    """Waits until a checkpoint is being written beside its place; False where the process ends before."""
+    while process.poll() is None:
+        if any(run_dir.glob(f"{checkpoint.FOLDER}/*orbax-checkpoint-tmp*")):
+            return True
+        time.sleep(0.001)
+    return False
+
+
+def limits(folder: Path, options: dict) -> Iterator[Found]:
     reference = undisturbed(folder, "host")
-    moments = [("at the start", limit) for limit in MEMORIES_MB]
-    moments += [(f"from {line!r} on", more) for line in ("compiling", "step") for more in MORE_MB]
-    for number, (moment, allowed_mb) in enumerate(moments):
-        arguments = (*RUN, "backend=host", f"total_steps={END}", f"run_dir=memory{number}")
-        if moment == "at the start":
-            process = started(*arguments, cwd=folder, memory_mb=allowed_mb)
-        else:
-            process = started(*arguments, cwd=folder)
-            next(line for line in process.stdout if line.startswith(moment.split("'")[1]))
+    kinds = [(f"{size} MiB", "", resource.RLIMIT_AS, size << 20) for size in MEMORIES_MB]
+    kinds += [
+        (f"{more} MiB more from {word!r} on", word, resource.RLIMIT_AS, more << 20)
+        for word in ("compiling", "step")
+        for more in MORE_MB
+    ]
+    kinds += [(f"{count} open files", "", resource.RLIMIT_NOFILE, count) for count in OPEN_FILES]
+    for number, (what, word, kind, amount) in enumerate(kinds):
+        arguments = (*RUN, "backend=host", f"total_steps={END}", f"run_dir=limits{number}")
+        process = started(*arguments, cwd=folder, limit=None if word else (kind, amount))
+        if word:
+            said_until(process, word)
             held = int(Path(f"/proc/{process.pid}/statm").read_text().split()[0]) * resource.getpagesize()
-            resource.prlimit(process.pid, resource.RLIMIT_AS, (held + (allowed_mb << 20),) * 2)
+            resource.prlimit(process.pid, kind, (held + amount,) * 2)
         try:
             errors = process.communicate(timeout=ANSWER_S)[1]
         except subprocess.TimeoutExpired:
@@ -280,11 +317,11 @@ def memory(folder: Path, options: dict) -> Iterator[Found]:
         ended = SAME if process.returncode == 0 else one_line(process.returncode, errors, expected=None)
         if ended in FINE:
             command(*arguments, cwd=folder)
-            ended = same_end(folder / f"memory{number}", reference)
-        yield f"{allowed_mb} MiB {'more ' * (moment != 'at the start')}{moment}", ended
+            ended = same_end(folder / f"limits{number}", reference)
+        yield what, ended
 
 
-PARTS = {part.__name__: part for part in (careless, files, signals, twice, disk, kills, memory)}
+PARTS = {part.__name__: part for part in (careless, files, signals, twice, disk, kills, limits)}
 
 
 OPTIONS = {

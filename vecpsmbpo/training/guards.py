@@ -3,8 +3,11 @@
 import contextlib
 import errno
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from vecpsmbpo import shortages, words
 from vecpsmbpo.settings import SettingError
@@ -44,13 +47,22 @@ def alone_in(run_dir: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def disk_errors(run_dir: Path) -> Iterator[None]:
     """Turns a disk that cannot be read or written into one line."""
+    hook = sys.unraisablehook
+    sys.unraisablehook = partial(_unless_given_up, hook)
     try:
         yield
+        sys.unraisablehook = hook  # after an error more of them may come until the process ends
     except (OSError, ValueError) as error:
         number = shortages.number_of(error)
         if number not in shortages.OF_DISKS:
             raise
         raise DiskError(f"run_dir={run_dir}: cannot be written ({os.strerror(number)})") from None
+
+
+def _unless_given_up(hook: Callable[[Any], object], unraisable: Any) -> None:
+    """Where one file cannot be written, orbax closes the loop that waits for the others, and each of them says so."""
+    if "Event loop is closed" not in str(unraisable.exc_value):
+        hook(unraisable)
 
 
 @contextlib.contextmanager
