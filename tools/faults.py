@@ -350,7 +350,7 @@ def main(words: Sequence[str]) -> int:
 def keep(part: str, rows: list[dict]) -> None:
     """Puts the rows in the place of those that the table had of this part."""
     others = list(csv.DictReader(OUT.open())) if OUT.exists() else []
-    rows = [row for row in others if row["part"] != part] + rows
+    rows = [row for row in others if row["part"] in PARTS.keys() - {part}] + rows
     with OUT.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["part", "what", "ended"], lineterminator="\n")
         writer.writeheader()

@@ -1,7 +1,7 @@
 """ONE soft actor-critic agent (A.2, equations 22 to 29): init, act, update.
 
 As in Acme, and as the paper says: twin Q functions and no value network, so that V in equations 24 and 29 is
-min(Q_1, Q_2) - α log π under the target critic; the temperature α is learned.
+min(Q_1, Q_2) - α log π under the target critic; the entropy coefficient α is learned.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class SacStats(Stats):
 
 
 class Agent(struct.PyTreeNode):
-    """Networks, target, temperature α, and the state of Adam for each."""
+    """Networks, target, entropy coefficient α, and the state of Adam for each."""
 
     actor: Params
     critic: Params
@@ -178,7 +178,7 @@ def update(
     target_every: int = 1,
     mean: Callable[[Any], Any] = lambda parts: parts,
 ) -> Agent:
-    """One gradient step of critic, actor and temperature, and every `target_every` such steps one of the target
+    """One gradient step of critic, actor and α, and every `target_every` such steps one of the target
     critic's average.
 
     Args:
@@ -208,6 +208,7 @@ def update(
 
     due = critic_optimizer.count % target_every == 0
     target_rate = jnp.where(due, hyper.target_update_rate, 0.0)
+    # Not optax.incremental_update, which rounds both of its products: an average moves by less than they are wrong.
     target_critic = jax.tree.map(
         lambda average, new: average + target_rate * (new - average), agent.target_critic, critic
     )

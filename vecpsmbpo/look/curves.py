@@ -22,7 +22,7 @@ AXES = {
     "eval_length": "length of evaluation episodes",
     "real_ratio": "λ, the share of real data",
     "real_ratio_probs": "probability of each λ",
-    "alpha": "SAC's temperature α",
+    "alpha": "SAC's entropy coefficient α",
     "entropy": "policy entropy",
     "q_mean": "mean Q",
     "critic_loss": "critic loss",

@@ -63,7 +63,7 @@ class Trained:
         return self._some(self._members, self.state.agents.actor)
 
     def critics(self) -> tuple[Any, Array]:
-        """Parameters of every member's critics, leaves [N·M, ...], and its temperature α, [N·M]."""
+        """Parameters of every member's critics, leaves [N·M, ...], and its entropy coefficient α, [N·M]."""
         agents = self.state.agents
         return self._some(self._members, agents.critic), np.exp(np.asarray(self._some(self._members, agents.log_alpha)))
 

@@ -41,7 +41,7 @@ INSIDE = (
     ("real_ratio", "λ: the share of real rows in what policies learn from", False),
     ("critic_loss", "critic loss", True),
     ("actor_loss", "actor loss", False),
-    ("alpha", "α: SAC's temperature", False),
+    ("alpha", "α: SAC's entropy coefficient", False),
     ("entropy", "entropy of the policies", False),
     ("q_mean", "mean Q of what is learned from", False),
     ("model_loss", "negative log-likelihood of the models (equation 17)", False),

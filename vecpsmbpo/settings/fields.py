@@ -21,15 +21,22 @@ def whole(at_least: int, at_most: int = LARGEST_WHOLE) -> Any:
 
 
 def real(
-    at_least: float | None = None, at_most: float | None = None, *, open_low: bool = False, traced: bool = False
+    at_least: float | None = None,
+    at_most: float | None = None,
+    *,
+    open_low: bool = False,
+    traced: bool = False,
+    infinite: bool = False,
 ) -> Any:
     """A setting that is a real number.
 
     Args:
         open_low: it must be above `at_least`.
         traced: it is a number inside the compiled program (`types.Hyper`), so that several values fit into one.
+        infinite: it may be infinite, too.
     """
-    return dataclasses.field(metadata={"range": (at_least, at_most), "open_low": open_low, "traced": traced})
+    about = {"range": (at_least, at_most), "open_low": open_low, "traced": traced, "infinite": infinite}
+    return dataclasses.field(metadata=about)
 
 
 def choice(*names: str) -> Any:
@@ -93,7 +100,7 @@ def _number(field: Any, value: Any, complaint: SettingError) -> Any:
         if not math.isfinite(number) or number != int(number):
             raise complaint
         number = int(number)
-    elif math.isinf(number) and field.name != "temperature":  # τ = ∞ is uniform sampling, equation 18
+    elif math.isinf(number) and not field.metadata.get("infinite", False):
         raise complaint
     low, high = field.metadata.get("range", (None, None))
     too_low = low is not None and (number < low or (number == low and field.metadata.get("open_low", False)))

@@ -63,7 +63,7 @@ class PosteriorSettings(Settings):
     real_ratio: float = real(0, 1, traced=True)
     real_ratio_schedule: str = choice("constant", "linear", "bandit")
     real_ratio_arms: tuple[float, ...] = real(0, 1)
-    temperature: float = real(0, open_low=True, traced=True)
+    temperature: float = real(0, open_low=True, traced=True, infinite=True)  # ∞ is uniform sampling, equation 18
     weights: str = choice("returns", "values")
     posterior: str = choice("sample", "average")
 
