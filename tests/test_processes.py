@@ -81,6 +81,21 @@ def test_several_processes_are_one_with_as_many_devices(start, tmp_path):
     assert "distributed: ''" in (several / "config.yaml").read_text()
 
 
+@pytest.mark.slow
+def test_a_run_goes_on_in_any_number_of_processes(start, tmp_path):
+    """One process, then four, then two, with four devices always: as one process alone, to the bit."""
+    task = ("env=ball_in_cup", "backend=host", "num_seeds=4")
+    alone(4, tmp_path, *task, "total_steps=40", "run_dir=several")
+    for count, steps in ((4, 80), (2, 120)):
+        ended = end(start(count, *task, f"total_steps={steps}", "run_dir=several", devices=4 // count))
+        assert [status for status, _, _ in ended] == [0] * count, ended
+    alone(4, tmp_path, *task, "total_steps=120", "run_dir=alone")
+    several, one = tmp_path / "several", tmp_path / "alone"
+    assert arrays(several, 120) == arrays(one, 120)
+    for name in (jsonl.METRICS_FILE, jsonl.EPISODES_FILE):
+        assert without_times(jsonl.read(several / name)) == without_times(jsonl.read(one / name))
+
+
 LONG = ("env=ball_in_cup", "backend=host", "total_steps=1000000", "run_dir=run")
 
 
