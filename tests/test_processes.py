@@ -63,9 +63,10 @@ def arrays(run_dir, step):
     return json.loads((run_dir / f"checkpoints/{step}/host/metadata").read_text())["arrays"]
 
 
-def test_several_processes_are_one_with_as_many_devices(start, tmp_path):
+@pytest.mark.parametrize(("backend", "devices"), [("host", 2), ("mjx", 1)])
+def test_several_processes_are_one_with_as_many_devices(backend, devices, start, tmp_path):
     """Also where one goes on with what several have begun."""
-    count, devices, task = 2, 2, ("env=ball_in_cup", "backend=host", "num_seeds=2")
+    count, task = 2, ("env=ball_in_cup", f"backend={backend}", "num_seeds=2")
     ended = end(start(count, *task, "total_steps=80", "run_dir=several", devices=devices))
     assert [status for status, _, _ in ended] == [0] * count, ended
     said = [output for _, output, _ in ended]
@@ -150,13 +151,6 @@ def test_what_fails_in_one_fails_in_all(start, tmp_path):
     assert "vecpsmbpo: another process of the run has failed" in ended[1][2]
 
 
-def test_programs_with_mjx_inside_are_refused_in_all(start):
-    ended = end(start(2, "env=ball_in_cup", "run_dir=run"))
-    assert [status for status, _, _ in ended] == [2, 2]
-    line = "vecpsmbpo: distributed: needs backend=host, and env=ball_in_cup is stepped by MJX"
-    assert all(line in errors.splitlines() for _, _, errors in ended), ended
-
-
 def test_a_grid_is_not_one_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(["train", "-m", "seed=0,1", "distributed=auto"]) == 2
@@ -167,6 +161,15 @@ def test_a_grid_is_not_one_run(tmp_path, monkeypatch, capsys):
 def test_an_address_that_is_none(wrong):
     with pytest.raises(SettingError, match=r"^distributed=.*: must be auto, or host:port/index/processes"):
         processes.join(wrong)
+
+
+def test_a_task_on_a_device_of_another_process_is_one_line(monkeypatch):
+    """What jax says where a constant of a program lies there."""
+    with pytest.raises(RuntimeError, match="non-addressable"), processes.noticing_the_lost():
+        raise RuntimeError("Closing over jax.Array that spans non-addressable devices is not allowed.")
+    monkeypatch.setattr(processes, "are_several", lambda: True)
+    with pytest.raises(SettingError, match=r"^distributed: the task keeps arrays"), processes.noticing_the_lost():
+        raise RuntimeError("Closing over jax.Array that spans non-addressable devices is not allowed.")
 
 
 @pytest.mark.parametrize("here", [True, False])

@@ -210,6 +210,7 @@ def noticing_the_lost() -> Iterator[None]:
 
     Raises:
         LostProcess: one of them is gone.
+        SettingError: the task's own code computes on one of them.
     """
     try:
         yield
@@ -219,3 +220,10 @@ def noticing_the_lost() -> Iterator[None]:
         why = str(error).strip().splitlines()[0][:200]
         again = "the last checkpoint is whole; to go on, give the same command again, in all of them"
         raise LostProcess(f"another process of the run is gone ({why}); {again}") from None
+    except RuntimeError as error:
+        if not are_several() or "non-addressable" not in str(error):
+            raise
+        raise SettingError(
+            "distributed: the task keeps arrays on a device of another process (of jax.devices(), and not of "
+            "jax.local_devices()), so that it can be trained in one process only"
+        ) from None

@@ -60,11 +60,12 @@ class Simulator:
         """`line_search_iterations`: at most so many; None: as many as the model says."""
         if model.na:
             raise NotImplementedError("actuators with activations have state that `Physics` does not keep")
-        self._model = mjx.put_model(model, impl="jax")
+        here = jax.local_devices()[0]  # by itself MJX takes the first of all, which may be another process's
+        self._model = mjx.put_model(model, impl="jax", device=here)
         if line_search_iterations is not None:
             fewer = min(model.opt.ls_iterations, line_search_iterations)
             self._model = self._model.replace(opt=self._model.opt.replace(ls_iterations=fewer))
-        self._blank = mjx.make_data(model, impl="jax")
+        self._blank = mjx.make_data(model, impl="jax", device=here)
         self._contact_frames = contacts.frames_of_c(model)
         self._integrate_positions = positions_integrator(model)
         self._is_runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4

@@ -6,9 +6,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from vecpsmbpo import algorithms, envs, processes
+from vecpsmbpo import algorithms, envs
 from vecpsmbpo.drivers import Driver, HostDriver, ScanDriver
-from vecpsmbpo.settings import SettingError, Settings
+from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Hyper
 
 
@@ -16,11 +16,8 @@ def make_driver(settings: Settings) -> Driver:
     """The algorithm on the task, on this process's devices. `runtime.configure` comes first.
 
     Raises:
-        SettingError: there is no such task (`envs.make`), or it cannot be stepped by several processes.
+        SettingError: there is no such task (`envs.make`).
     """
-    if settings.backend == "mjx" and processes.are_several():
-        # What MJX makes of its model while it is traced lies on devices that not every process has.
-        raise SettingError(f"distributed: needs backend=host, and env={settings.env} is stepped by MJX")
     make_env = partial(envs.make, settings.env, settings.backend, **dict(settings.env_options))
     env = make_env(num_envs=len(settings.lanes), seed=settings.seed)
     if not settings.episode_length:
