@@ -22,6 +22,7 @@ import csv
 import io
 import json
 import random
+import re
 import resource
 import shutil
 import signal
@@ -45,6 +46,8 @@ RUN = ["size=tiny", "env=ball_in_cup", "loggers=[]"]  # 40 steps an epoch, a che
 STOPPED, END = 120, 160
 TO_LIVE_S = 10.0
 ANSWER_S = 100
+# The last words of C++, LLVM and XLA.
+NATIVE = re.compile(r"terminate called|  what\(\):  |LLVM ERROR: |[EF]\d{4} [\d:.]+ +\d+ \w+\.cc:\d+\] ")
 MEMORIES_MB = (200, 600, 1000, 1800, 2600, 3400, 4200, 5000)
 MORE_MB = (0, 1, 4, 16, 64, 128, 256)  # than it holds
 OPEN_FILES = (8, 16, 24, 32, 48, 64, 96, 128, 256)
@@ -88,8 +91,7 @@ def one_line(status: int, errors: str, expected: int | None = 2) -> str:
     if expected is None:
         expected = status or 1
     told = [line for line in errors.splitlines() if line.startswith("vecpsmbpo: ") and "warning" not in line]
-    native = ("terminate called", "  what():  ")  # C++'s own last words
-    others = [line for line in errors.splitlines() if not line.startswith(("vecpsmbpo: ", *native))]
+    others = [line for line in errors.splitlines() if not line.startswith("vecpsmbpo: ") and not NATIVE.match(line)]
     if (status, len(told), others) == (expected, 1, []):
         return ONE_LINE
     return f"status {status}, {len(told)} line(s), and besides {' '.join(others)[-200:]!r}"
