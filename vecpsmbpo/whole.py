@@ -14,7 +14,7 @@ def write(path: Path, make: Callable[[Path], object]) -> None:
     beside = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         make(beside)
-        with beside.open("rb") as file:
+        with beside.open("rb+") as file:
             os.fsync(file.fileno())  # or it would be empty, where power fails just after it was moved
         beside.replace(path)
     finally:
