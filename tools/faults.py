@@ -129,9 +129,10 @@ def said_until(process: subprocess.Popen, word: str) -> None:
 
 
 def undisturbed(folder: Path, backend: str) -> Path:
-    result = command(*RUN, f"backend={backend}", f"total_steps={END}", "run_dir=undisturbed", cwd=folder)
+    run_dir = folder / f"undisturbed_{backend}"
+    result = command(*RUN, f"backend={backend}", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
     assert result.returncode == 0, result.stderr
-    return folder / "undisturbed"
+    return run_dir
 
 
 # ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
