@@ -14,7 +14,7 @@ state with log lines that are lost and said to be, one line that says what is wr
                 gone on with (mounts them, so needs root)
     kills       kill -9 at random moments, one of five while a checkpoint is written, until the run is complete
     limits      of address space, from the start, while compiling and while training, and of open files; then gone on
-                with as without (a process that C++ ends may say that, too, beside the one line)
+                with as without (where not even the libraries have memory left, they may say so beside the one line)
 """
 
 import contextlib
@@ -46,8 +46,11 @@ RUN = ["size=tiny", "env=ball_in_cup", "loggers=[]"]  # 40 steps an epoch, a che
 STOPPED, END = 120, 160
 TO_LIVE_S = 10.0
 ANSWER_S = 100
-# The last words of C++, LLVM and XLA.
-NATIVE = re.compile(r"terminate called|  what\(\):  |LLVM ERROR: |[EF]\d{4} [\d:.]+ +\d+ \w+\.cc:\d+\] ")
+# The last words of C++, LLVM, XLA, and of a Python that has no memory for others.
+NATIVE = re.compile(
+    r"terminate called|  what\(\):  |LLVM ERROR: |[EF]\d{4} [\d:.]+ +\d+ \w+\.cc:\d+\] "
+    r"|Exception ignored in sys\.unraisablehook|MemoryError$"
+)
 MEMORIES_MB = (200, 600, 1000, 1800, 2600, 3400, 4200, 5000)
 MORE_MB = (0, 1, 4, 16, 64, 128, 256)  # than it holds
 OPEN_FILES = (8, 16, 24, 32, 48, 64, 96, 128, 256)
