@@ -93,8 +93,8 @@ def test_free_address_space_is_the_limit_less_what_is_taken(monkeypatch):
 def test_a_limit_on_address_space_is_one_line_before_anything_is_made(limit_mb, line, tmp_path):
     """With 900 MiB OpenBLAS would ask for memory again for ever."""
     limited = f"ulimit -v {limit_mb * 1024}; exec {sys.executable} -m vecpsmbpo.cli train size=tiny backend=host"
-    shell = ["bash", "-c", limited]
-    result = subprocess.run(shell, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
+    how = {"cwd": tmp_path, "env": environment(), "capture_output": True, "text": True, "timeout": 120, "check": False}
+    result = subprocess.run(["bash", "-c", limited], **how)
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith(f"vecpsmbpo: {line}")
     assert result.stderr.count("\n") == 1

@@ -78,9 +78,10 @@ def arrays(run_dir: Path) -> int | None:
 
 
 def same_end(run_dir: Path, undisturbed: Path) -> str:
-    if arrays(run_dir) is None:
+    state = arrays(run_dir)
+    if state is None:
         return "not gone on with"
-    if arrays(run_dir) != arrays(undisturbed):
+    if state != arrays(undisturbed):
         return "another end"
     return SAME if lines(run_dir) == lines(undisturbed) else "other logs"
 
@@ -246,8 +247,8 @@ def disk(folder: Path, options: dict) -> Iterator[Found]:
     small.mkdir()
     kinds = [(f"size={size}k", f"{size} KiB") for size in DISKS_KB]
     kinds += [(f"size=64m,nr_inodes={files}", f"{files} files") for files in DISKS_FILES]
-    for limits, what in kinds:
-        subprocess.run(["mount", "-t", "tmpfs", "-o", limits, "tmpfs", small], check=True)
+    for sizes, what in kinds:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", sizes, "tmpfs", small], check=True)
         try:
             arguments = (*RUN, "backend=host", f"total_steps={END}", "run_dir=disk/run")
             result = command(*arguments, cwd=folder)
