@@ -6,8 +6,10 @@ The cache also serves the programs that tests start as subprocesses: what one co
 import os
 import tempfile
 
+from tests import devices
+
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", os.path.join(tempfile.gettempdir(), "vecpsmbpo-tests-jax"))
-os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2 --xla_cpu_multi_thread_eigen=false"
+os.environ["XLA_FLAGS"] = devices.flags(2)
 
 import jax
 import pytest

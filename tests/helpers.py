@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from tests import devices
 from vecpsmbpo import algorithms, config, metrics
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.envs.host.batched import HostEnv
@@ -23,7 +24,6 @@ METRICS = {
     "actor_loss", "alpha", "q_mean", "real_ratio", "env_steps_per_s", "updates_per_s", "imagined_per_s",
     "seconds",
 }  # fmt: skip
-ONE_DEVICE = "--xla_force_host_platform_device_count=1"
 EPISODE = {
     "seed", "episode", "env_steps", "model", "policy", "return", "length", "terminated", "truncated", "random", "probs",
 }  # fmt: skip
@@ -60,13 +60,15 @@ def command(*arguments: str, cwd: Path, one_thread: bool = False, **kwargs: Any)
 
 def argv(*arguments: str, one_thread: bool = False) -> list[str]:
     """`one_thread` runs on a single core: one device, whose results are reproducible to the bit."""
-    one_core = ["taskset", "-c", "0"] if shutil.which("taskset") else ["env", f"XLA_FLAGS={ONE_DEVICE}"]  # not on macOS
+    one_core = (
+        ["taskset", "-c", "0"] if shutil.which("taskset") else ["env", f"XLA_FLAGS={devices.flags(1)}"]
+    )  # not on macOS
     return [*(one_core if one_thread else []), sys.executable, "-m", "vecpsmbpo.cli", *arguments]
 
 
-def environment() -> dict[str, str]:
-    """The program's own: without the devices that the tests set up for themselves."""
-    return {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+def environment(count: int | None = None) -> dict[str, str]:
+    """The program's own, or with so many devices: without those that the tests set up for themselves."""
+    return {**os.environ, "XLA_FLAGS": devices.flags(count)}
 
 
 def check_log(run_dir: Path, settings) -> None:

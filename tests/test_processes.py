@@ -16,7 +16,6 @@ from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.settings import SettingError
 
 RUN = ("train", "size=tiny", "loggers=[]")
-DEVICES = "--xla_force_host_platform_device_count={} --xla_cpu_multi_thread_eigen=false"
 
 
 @pytest.fixture
@@ -28,7 +27,7 @@ def start(tmp_path):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        where = {"cwd": tmp_path, "env": {**environment(), "XLA_FLAGS": DEVICES.format(devices)}, "text": True}
+        where = {"cwd": tmp_path, "env": environment(devices), "text": True}
         running = [
             subprocess.Popen(
                 argv(*RUN, *words, f"distributed=127.0.0.1:{port}/{index}/{count}"),
@@ -53,8 +52,9 @@ def end(running):
 
 
 def alone(devices, cwd, *words):
-    flags = {**environment(), "XLA_FLAGS": DEVICES.format(devices)}
-    done = subprocess.run(argv(*RUN, *words), cwd=cwd, env=flags, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        argv(*RUN, *words), cwd=cwd, env=environment(devices), capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
