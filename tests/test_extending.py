@@ -1,5 +1,6 @@
-"""What docs/extending.md promises: each of its patches touches the files named there, and trains."""
+"""What docs/extending.md promises: each of its patches touches the files named there, and works."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests import looks
 from tests.helpers import environment
 from vecpsmbpo import metrics
 
@@ -40,18 +42,24 @@ def extended(tmp_path_factory):
     return site
 
 
-def train(site: Path, run_dir: Path, *words: str) -> tuple[list[dict], list[dict]]:
-    """The lines of a tiny run."""
-    argv = [sys.executable, "-m", "vecpsmbpo.cli", "train", "env=cartpole_swingup", "size=tiny", "backend=host"]
+def python(site: Path, cwd: Path, *argv: str) -> str:
+    """What Python says, with the extended package."""
     result = subprocess.run(
-        [*argv, f"run_dir={run_dir}", *words],
-        cwd=run_dir.parent,
+        [sys.executable, *argv],
+        cwd=cwd,
         env={**environment(), "PYTHONPATH": str(site)},
         capture_output=True,
         text=True,
         timeout=600,
     )
     assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def train(site: Path, run_dir: Path, *words: str) -> tuple[list[dict], list[dict]]:
+    """The lines of a tiny run."""
+    task = ("env=cartpole_swingup", "size=tiny", "backend=host", f"run_dir={run_dir}")
+    python(site, run_dir.parent, "-m", "vecpsmbpo.cli", "train", *task, *words)
     return metrics.read(run_dir / "metrics.jsonl"), metrics.read(run_dir / "episodes.jsonl")
 
 
@@ -78,3 +86,22 @@ def test_a_new_rule_and_a_new_number_are_logged(extended, tmp_path):
             earned[line["model"], line["policy"]] += line["return"]
             counts[line["model"], line["policy"]] += 1
     assert counts.sum() >= 2
+
+
+BARS = """
+import json, pathlib
+from vecpsmbpo.look import earned, runs
+axes = earned.draw(runs.load(pathlib.Path("run")).lanes[0]).axes[0]
+print(json.dumps([[bar.get_height() for bar in axes.patches], [text.get_text() for text in axes.texts]]))
+"""
+
+
+def test_a_new_picture_is_on_the_page(extended, tmp_path):
+    looks.write(tmp_path / "run", looks.epochs([1, 2, 3]), looks.episodes(6))
+    python(extended, tmp_path, "-m", "vecpsmbpo.cli", "report", "run", "out=page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "seed 0: mean return of each member, and in how many episodes it acted" in page
+    # Members 1, 2, 3, 0, 1 earned 1 to 5; the episode before theirs was random.
+    heights, counts = json.loads(python(extended, tmp_path, "-c", BARS))
+    assert heights == [4, 3, 2, 3]
+    assert counts == ["1", "2", "1", "1"]

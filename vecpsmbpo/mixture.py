@@ -42,9 +42,9 @@ def linear(mean: Number, progress: Float[Array, "*steps"] | float) -> Float[Arra
 # here every member is such a draw: of N·M members, a share p_i learns with arm i, and whichever of them equation 18 or
 # 19 lets act plays its arm. At first all arms learn side by side, each with critics of its own, from the same real
 # data D_E; when one shows to be better, more and more members learn with it. Two other ways were tried
-# (docs/results.md): λ changed every epoch for all members together spoils all critics in an epoch of a bad λ and blames
-# the arm after it; and with an arm for each member for good, the best one learns from data of which the others gather
-# most.
+# (docs/lab_notes.md): λ changed every epoch for all members together spoils all critics in an epoch of a bad λ and
+# blames the arm after it; and with an arm for each member for good, the best one learns from data of which the others
+# gather most.
 #
 # What an arm is worth changes while it learns, so that a rule which competes with the best single arm in hindsight
 # (explore-then-commit, UCB, Exp3) competes with the wrong thing. Exp3.S and its kin follow changes whatever causes

@@ -1,7 +1,7 @@
 """One simulator step of an MJX model, as C MuJoCo takes it and compiled once.
 
 Two things differ from `mjx.step`. MJX unrolls the four stages of its Runge–Kutta integrator, so that a program holds
-four copies of the whole dynamics and takes about three times as long to compile; here the stages are a loop around
+four copies of the whole dynamics and takes about twice as long to compile; here the stages are a loop around
 `forward`, with the same arithmetic and the same order of the sums. And `forward` gives contacts the tangents that C
 MuJoCo gives them (see `contacts`).
 """
