@@ -9,6 +9,7 @@ from mujoco import mjx
 
 from vecpsmbpo.envs.mjx import contacts, simulator
 from vecpsmbpo.envs.mjx.base import MjxEnv
+from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import EnvSpec
 
 CAPSULE = """
@@ -85,8 +86,8 @@ class Slider(MjxEnv):
 
     spec = EnvSpec("slider", 1, 1, 10, lambda obs, action, next_obs: obs[..., 0] * action[..., 0] > 0)
 
-    def __init__(self):
-        super().__init__(mujoco.MjModel.from_xml_string(SLIDER), substeps=2)
+    def __init__(self, xml=SLIDER):
+        super().__init__(mujoco.MjModel.from_xml_string(xml), substeps=2)
 
     def initial_state(self, key):
         return jnp.ones(1), jnp.zeros(1)
@@ -109,6 +110,12 @@ def test_a_rule_of_termination_gets_the_state_before_the_action_and_the_state_af
     state = env.reset(jax.random.key(0))
     step = jax.jit(env.step)
     assert [float(step(state, jnp.array([a])).done) for a in (-1.0, 1.0)] == [0, 1]
+
+
+def test_an_actuator_without_a_range_is_an_error():
+    """MuJoCo gives it one of 0 to 0, to which every action would be scaled."""
+    with pytest.raises(SettingError, match="actuator 0: its model gives it no ctrlrange"):
+        Slider(SLIDER.replace(' ctrlrange="-1 1"', ""))
 
 
 def test_tasks_keep_their_model_s_line_search_unless_they_say_otherwise():

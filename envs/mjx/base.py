@@ -9,6 +9,7 @@ import mujoco
 from brax.envs.base import Env, State
 
 from vecpsmbpo.envs.mjx.simulator import Physics, Simulator
+from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import EnvSpec
 
 
@@ -43,7 +44,13 @@ class MjxEnv(SpecEnv):
             model: of the original task, unchanged.
             substeps: simulator steps per control step.
             line_search_iterations: most of them, see `simulator.LINE_SEARCH_ITERATIONS`; None: as the model says.
+
+        Raises:
+            SettingError: an actuator has no control range, to which actions are scaled.
         """
+        for index, (low, high) in enumerate(model.actuator_ctrlrange):
+            if low >= high:
+                raise SettingError(f"actuator {model.actuator(index).name or index}: its model gives it no ctrlrange")
         self.model = model
         self.substeps = substeps
         self._simulator = Simulator(model, line_search_iterations)
