@@ -81,6 +81,12 @@ def test_models_with_activations_are_refused():
         simulator.Simulator(mujoco.MjModel.from_xml_string(xml))
 
 
+SLIDER = """
+<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body></worldbody>
+<actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>
+"""
+
+
 class Slider(MjxEnv):
     """Moves along x; ends where the action pushes away from the origin, which the new observation does not tell."""
 
@@ -97,12 +103,6 @@ class Slider(MjxEnv):
 
     def reward(self, before, action, after):
         return after.qpos[0]
-
-
-SLIDER = """
-<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body></worldbody>
-<actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>
-"""
 
 
 def test_a_rule_of_termination_gets_the_state_before_the_action_and_the_state_after():
