@@ -54,7 +54,6 @@ class Settings:
     # real data
     warmup_steps: int = whole(1)
     replay_capacity: int = whole(1)
-    forced_exploration: float = real(0, traced=True)
     # dynamics models (A.1)
     n_models: int = whole(1)
     model_hidden_size: int = whole(1)
@@ -69,6 +68,8 @@ class Settings:
     validation_ratio: float = real(0, 0.5, open_low=True)
     whiten_targets: bool
     prior_scale: float = real(0, traced=True)
+    # who acts
+    forced_exploration: float = real(0, traced=True)
 
     @property
     def task(self) -> str:
@@ -110,7 +111,8 @@ class Settings:
 
     @property
     def traced(self) -> tuple[str, ...]:
-        """The settings that are numbers inside the compiled program (`types.Hyper`)."""
+        """The settings that are numbers inside the compiled program (`types.Hyper`), as they are declared: that order
+        is also one of leaves in checkpoints, which cannot be read with another."""
         return tuple(field.name for field in dataclasses.fields(self) if is_traced(field))
 
     @property

@@ -13,7 +13,6 @@ class PolicySettings(Settings):
 
     policy_hidden_size: int = whole(1)
     policy_hidden_layers: int = whole(1)
-    discount: float = real(0, 1, traced=True)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,6 +24,7 @@ class SacSettings(PolicySettings):
     policy_learning_rate_decay_steps: int = whole(1)
     policy_batch_size: int = whole(1)
     updates_per_step: int = whole(1)
+    discount: float = real(0, 1, traced=True)
     target_entropy: float = real(traced=True)
     target_update_rate: float = real(0, 1, open_low=True, traced=True)
     target_update_every: int = whole(1)
