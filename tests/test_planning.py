@@ -141,7 +141,7 @@ def test_a_run_plans_well(kind):
     assert np.mean(planned[-10:]) > 0.8  # uniform actions: 2/3
     assert {(line["model"], line["policy"], len(line["probs"])) for line in lines} == {(0, 0, 1)}
     assert (driver.evaluate(state, evaluation_keys(settings, 0), 2).episode_return > 0.8).all()
-    line = metrics.epoch_lines(state, settings)[0]
+    line = metrics.epoch_lines(state, driver.algorithm)[0]
     assert line["critic_loss"] is None
     assert line["model_val_mse"] < 0.1
 

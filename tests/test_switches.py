@@ -210,7 +210,7 @@ def run(kind="scan", **changes):
     for epoch in range(settings.total_steps // settings.epoch_steps):
         state, news = driver.run(state, settings.epoch_steps // settings.stride)
         lines += metrics.episode_lines(news, epoch * settings.epoch_steps, settings)
-        epochs += metrics.epoch_lines(state, settings)
+        epochs += metrics.epoch_lines(state, driver.algorithm)
     return settings, driver, state, lines, epochs
 
 

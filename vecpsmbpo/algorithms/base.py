@@ -16,7 +16,18 @@ import numpy as np
 from vecpsmbpo import dynamics, health, posterior, replay
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import Counters, EnvSpec, Episode, EpisodeEnd, Hyper, Moments, Posterior, SeedState, Transition
+from vecpsmbpo.types import (
+    Counters,
+    EnvSpec,
+    Episode,
+    EpisodeEnd,
+    Hyper,
+    Moments,
+    Posterior,
+    SeedState,
+    Transition,
+    Whole,
+)
 
 
 @dataclass(frozen=True)
@@ -67,6 +78,16 @@ class Algorithm(ABC):
         """What is remembered when an episode begins."""
         return ()
 
+    @property
+    def nets(self) -> Any:
+        """The networks of a member, or None where it has none."""
+        return None
+
+    def numbers(self, counters: Counters, state: SeedState) -> dict[str, Any]:
+        """What it has to say in an epoch's line of metrics.jsonl besides the members' `stats`: numbers, and lists of
+        them, by name. Called on the host, with a state without models, agents and rings."""
+        return {}
+
     def values(self, state: SeedState) -> jax.Array | None:
         """[N·M] what each member promises, where `weights=values`, or None."""
         return None
@@ -91,6 +112,10 @@ class Algorithm(ABC):
     @property
     def ring_capacity(self) -> int:
         """C_M: rows that are imagined for a member and kept; 0 where none are."""
+        return 0
+
+    def retained_rows(self, env_steps: Whole) -> Whole:
+        """How many of the newest rows that were imagined for a member it learns from after `env_steps` steps."""
         return 0
 
     def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Any:

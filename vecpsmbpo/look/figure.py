@@ -17,7 +17,6 @@ from vecpsmbpo.look.experiments import Experiment
 from vecpsmbpo.look.groups import Group
 from vecpsmbpo.look.runs import Lane
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.settings.parts import PosteriorSettings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -241,10 +240,8 @@ def draw_weights(experiment: Experiment) -> "Figure":
     style.steps_axis(returns, AXES["env_steps"])
     returns.set_ylabel("return")
     returns.legend()
-    settings = lane.run.settings
-    assert isinstance(settings, PosteriorSettings)
     where = f"experiment={experiment.name} size={experiment.size}"
-    title = f"{settings.task}: {where}, {lane.name}, τ = {settings.temperature:g}"
+    title = f"{lane.run.settings.task}: {where}, {lane.name}, τ = {lane.setting('temperature'):g}"
     figure.suptitle(title, x=0.01, ha="left", fontsize=9)
     return figure
 

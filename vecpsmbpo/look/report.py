@@ -18,7 +18,6 @@ from vecpsmbpo.look import compare, diagnose, files, groups, runs, statistics
 from vecpsmbpo.look.curves import AXES, curve
 from vecpsmbpo.look.runs import Lane, Run
 from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.settings.parts import PosteriorSettings
 
 if TYPE_CHECKING:
     from vecpsmbpo.look.page import Page
@@ -282,12 +281,12 @@ def _chances_picture(page: "Page", run: Run) -> str:
     from vecpsmbpo.look import style
 
     columns = [lane.epochs["real_ratio_probs"] for lane in run.lanes if "real_ratio_probs" in lane.epochs]
-    if not columns or not isinstance(run.settings, PosteriorSettings):
+    if not columns:
         return ""
     shortest = min(map(len, columns))
     chances = np.mean([column[:shortest] for column in columns], axis=0)
     figure, (axes,) = style.grid(1, 1, (4.4, 2.9))
-    arms = run.settings.real_ratio_arms
+    arms = run.lanes[0].setting("real_ratio_arms")
     for look, arm, chance in zip(style.looks(len(arms), ordered=True), arms, chances.T, strict=True):
         style.line(axes, look, run.lanes[0].epochs["env_steps"][:shortest], chance, label=f"λ = {arm:g}")
     style.steps_axis(axes, AXES["env_steps"])

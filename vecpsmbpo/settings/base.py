@@ -101,6 +101,21 @@ class Settings:
         """Whether members are drawn by what their critics promise, and not by what they have earned."""
         return False
 
+    @property
+    def plans_actions(self) -> bool:
+        """Whether actions are planned in the models; there is no policy then."""
+        return False
+
+    @property
+    def learns_by_sac(self) -> bool:
+        """Whether every member is an agent of `sac`, whose actor and critics can be asked by themselves."""
+        return False
+
+    @property
+    def averages_members(self) -> bool:
+        """Whether all members act together, and none is drawn."""
+        return False
+
     @functools.cached_property
     def lanes(self) -> tuple[dict[str, Any], ...]:
         """The S learners of the program: every seed with every combination of swept values, as log lines name them."""

@@ -36,6 +36,10 @@ class SacSettings(PolicySettings):
     def minibatch(self) -> int:
         return self.policy_batch_size
 
+    @property
+    def learns_by_sac(self) -> bool:
+        return True
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImaginationSettings(SacSettings):
@@ -80,6 +84,10 @@ class PosteriorSettings(Settings):
     def weighs_values(self) -> bool:
         return self.weights == "values"
 
+    @property
+    def averages_members(self) -> bool:
+        return self.posterior == "average"
+
     def may_change(self, name: str) -> bool:
         falls = self.real_ratio_schedule == "linear"  # over the whole run
         return super().may_change(name) and not (falls and name == "total_steps")
@@ -101,6 +109,6 @@ class PosteriorSettings(Settings):
         )
         yield list(self.real_ratio_arms) != sorted(set(self.real_ratio_arms)), f"real_ratio_arms=[{arms}]: must rise"
         yield (
-            self.adapts_real_ratio and self.posterior == "average",
+            self.adapts_real_ratio and self.averages_members,
             "posterior=average: no policy earns what real_ratio_schedule=bandit would choose by",
         )

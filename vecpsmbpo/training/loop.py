@@ -250,7 +250,7 @@ class _Session:
 
     def _epoch_lines(self) -> list[metrics.Line]:
         state = processes.here(self.state.without_rings())
-        return metrics.epoch_lines(placement.unpad(self.driver.layout, state), self.settings)
+        return metrics.epoch_lines(placement.unpad(self.driver.layout, state), self.driver.algorithm)
 
     def _note_frozen(self) -> None:
         """Says and writes which lanes were frozen in the chunk that ended."""

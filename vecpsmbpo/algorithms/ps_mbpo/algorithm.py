@@ -16,7 +16,7 @@ from vecpsmbpo import health, imagination, mixture, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
 from vecpsmbpo.sac import Agent
-from vecpsmbpo.types import Bandit, Counters, Hyper, Params, Posterior, SeedState, Transition
+from vecpsmbpo.types import Bandit, Counters, Hyper, Params, Posterior, SeedState, Transition, Whole
 
 
 class Evidence(struct.PyTreeNode):
@@ -47,6 +47,9 @@ class PsMbpo(Algorithm):
     def ring_capacity(self) -> int:
         return imagination.ring_capacity(self.settings)
 
+    def retained_rows(self, env_steps: Whole) -> jax.Array:
+        return imagination.retained_rows(self.settings, env_steps)
+
     def working_bytes(self, row: int) -> int:
         """Minibatches of a step, or rows in flight of a rollout."""
         settings = self.settings
@@ -63,12 +66,19 @@ class PsMbpo(Algorithm):
             starts = None
         return state.replace(own=Evidence(starts, mixture.init(settings) if settings.adapts_real_ratio else None))
 
+    def numbers(self, counters: Counters, state: SeedState) -> dict[str, Any]:
+        """λ, of several members their mean, and τ; where λ is chosen online, how likely each is the best."""
+        bandit = state.own.bandit
+        ratio = np.asarray(self.real_ratios(counters, state), np.float64).mean()
+        chosen = {} if bandit is None else {"real_ratio_probs": mixture.probabilities(bandit)}
+        return {"real_ratio": ratio, "temperature": state.hyper.temperature, **chosen}
+
     # ── who acts: once an episode ────────────────────────────────────────────────────────────────────────────
 
     def draw(self, members: Posterior, values: Any, hyper: Hyper, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """A member by equation 18 or 19; with `posterior=average` none, -1."""
         member, probs = posterior.draw(posterior.logits(members, values, hyper.temperature), key)
-        return jnp.int32(-1) if self.settings.posterior == "average" else member, probs
+        return jnp.int32(-1) if self.settings.averages_members else member, probs
 
     def credit(self, state: SeedState, episode_return: jax.Array, counts: jax.Array) -> SeedState:
         """To the member (equation 19) and, where λ is chosen online, to the λ that it learned with."""
@@ -89,7 +99,7 @@ class PsMbpo(Algorithm):
     def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
         """An action sampled from the policy of the episode's member, or with `posterior=average` from all members'."""
         actors = state.agents.actor
-        if self.settings.posterior == "average":
+        if self.settings.averages_members:
             return self._of_mixture(actors, obs, key), ()
         return self._of_member(state.episode.member, actors, obs, key), ()
 
@@ -163,7 +173,7 @@ class PsMbpo(Algorithm):
     @property
     def _evaluates_all(self) -> bool:
         # Nobody earns anything where all act together: there is no best member either, and all are it.
-        return "average" in (self.settings.eval_policy, self.settings.posterior)
+        return self.settings.averages_members or self.settings.eval_policy == "average"
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
@@ -283,7 +293,7 @@ class PsMbpo(Algorithm):
         shape = (self.settings.updates_per_step, self.settings.policy_batch_size)
         source_key, real_key, imagined_key = jax.random.split(key, 3)
         real_index = replay.sample_indices(real_key, shape, counters.env_steps, state.real.shape[0])
-        newest = imagination.retained_rows(self.settings, counters.env_steps)
+        newest = self.retained_rows(counters.env_steps)
         imagined_index = replay.sample_newest_indices(
             imagined_key, shape, counters.imagined_rows, imagined.shape[0], newest
         )
