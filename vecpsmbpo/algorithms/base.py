@@ -6,7 +6,7 @@ Everything here runs inside `layout.Layout.jit_shard_map`: models and agents are
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -15,6 +15,7 @@ import numpy as np
 
 from vecpsmbpo import dynamics, health, posterior, replay
 from vecpsmbpo.layout import Layout
+from vecpsmbpo.networks import GaussianMLP
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import (
     Counters,
@@ -37,6 +38,11 @@ class Algorithm(ABC):
     settings: Settings
     spec: EnvSpec
     layout: Layout
+
+    @cached_property
+    def model_net(self) -> GaussianMLP:
+        """The network of every dynamics model."""
+        return dynamics.network(self.settings, self.spec)
 
     # ── what an algorithm adds ───────────────────────────────────────────────────────────────────────────────
 

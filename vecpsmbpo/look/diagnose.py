@@ -158,13 +158,12 @@ class _Probe:
         }
 
     def _models(self, trained: "Trained", seen: Any, random: np.random.Generator, key: Any) -> dict[str, Any] | None:
-        from vecpsmbpo import dynamics
         from vecpsmbpo.look import diagnostics
 
         models, spec = trained.models(), trained.algorithm.spec
         if models is None:
             return None
-        net = dynamics.network(trained.run.settings, spec)
+        net = trained.algorithm.model_net
         windows = diagnostics.windows(seen, self._horizon, self._length, random)
         windows = windows.until(int(windows.there.any(axis=0).sum()))
         mean, variance = diagnostics.imagine(models, windows.obs, windows.action, key, net=net, spec=spec)

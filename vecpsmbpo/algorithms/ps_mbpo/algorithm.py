@@ -220,8 +220,10 @@ class PsMbpo(Algorithm):
             draw = partial(imagination.start_states, state.real, counters.env_steps, count=chunk, spec=spec)
             return jax.vmap(draw)(keys)
 
+        imagined_step = partial(imagination.step, net=self.model_net, nets=self.nets, settings=settings, spec=spec)
+
         def advance(model, actor, obs, fresh, key):
-            transition = imagination.step(model, actor, obs, key, settings=settings, spec=spec)
+            transition = imagined_step(model, actor, obs, key)
             return replay.pack(transition), jnp.where(transition.terminated[:, None], fresh, transition.next_obs)
 
         def step(t, carry):

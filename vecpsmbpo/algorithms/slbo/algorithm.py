@@ -53,6 +53,7 @@ class Slbo(Algorithm):
         """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""
         layout = self.layout
         whitening = dynamics.scaling(state.moments, counters.env_steps, self.settings)
+        fit = partial(multistep.fit, net=self.model_net, settings=self.settings, spec=self.spec)
 
         def learn(model, agent, key, counters, real, whitening, hyper):
             rows = counters.env_steps
@@ -60,7 +61,7 @@ class Slbo(Algorithm):
             def round_(learned, key):
                 model, agent = learned
                 model_key, policy_key = jax.random.split(key)
-                model = multistep.fit(model, real, rows, hyper, model_key, settings=self.settings, spec=self.spec)
+                model = fit(model, real, rows, hyper, model_key)
 
                 def policy_step(agent, key):
                     rollout_key, update_key = jax.random.split(key)
@@ -91,7 +92,7 @@ class Slbo(Algorithm):
         SLBO's code starts them from the environment's initial states, which a model cannot draw.
         """
         settings, spec = self.settings, self.spec
-        net, count, length = dynamics.network(settings, spec), settings.policy_rollouts, settings.policy_rollout_length
+        net, count, length = self.model_net, settings.policy_rollouts, settings.policy_rollout_length
 
         def real_states(key):
             return imagination.start_states(real, counters.env_steps, key, count, spec)

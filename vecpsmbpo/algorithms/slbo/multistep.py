@@ -67,11 +67,11 @@ def fit(
     hyper: Hyper,
     key: PRNGKeyArray,
     *,
+    net: networks.GaussianMLP,
     settings: SlboSettings,
     spec: EnvSpec,
 ) -> Model:
     """The model after `model_steps` of Adam. real: D_E, of which `rows` were added."""
-    net = dynamics.network(settings, spec)
 
     def step(carry, key):
         params, optimizer = carry
