@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vecpsmbpo import jsonl
+from vecpsmbpo import jsonl, logged
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE, Line
 from vecpsmbpo.loggers import Loggers
@@ -19,8 +19,7 @@ from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
 SESSIONS_FILE = "sessions.jsonl"
-# In every line, null where nothing learns so.
-LEARNED = ("critic_loss", "actor_loss", "alpha", "q_mean", "entropy", "real_ratio", "temperature")
+ALWAYS = tuple(name for name, number in logged.NUMBERS.items() if number.always)
 read = jsonl.read
 
 
@@ -161,7 +160,7 @@ def epoch_lines(state: TrainState, algorithm: Algorithm) -> list[Line]:
                 "train_episodes": int(episodes),
                 "unsound_steps": int(seeds.epoch_unsound[seed]),
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
-                **dict.fromkeys(LEARNED),
+                **dict.fromkeys(ALWAYS),
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
                 **{
                     name: np.asarray(value).tolist() if np.ndim(value) else _number(value)
