@@ -101,7 +101,7 @@ def forward(
 
 
 class Successor(NamedTuple):
-    """A draw from the model: next_obs [..., O], reward [...], terminated [...] bool."""
+    """What follows in the model: next_obs [..., O], reward [...], terminated [...] bool."""
 
     next_obs: jax.Array
     reward: jax.Array
@@ -116,39 +116,20 @@ def predict(
     *,
     net: networks.GaussianMLP,
     spec: EnvSpec,
+    sampled: bool = True,
 ) -> Successor:
-    """A draw of (s', r) ~ N((s + Δs, r), σ²) (equation 21), and whether it ends the episode: by the task's own rule,
-    or drawn with the learned probability where that is not known.
+    """A draw of (s', r) ~ N((s + Δs, r), σ²) (equation 21), or the mean of that where it is not `sampled`; and whether
+    it ends the episode: by the task's own rule, or drawn with the learned probability where that is not known.
     """
     prediction = forward(model, obs, action, net=net)
-    noise = jax.random.normal(key, prediction.mean.shape)
-    sample = prediction.mean + jnp.exp(0.5 * prediction.log_variance) * noise
-    return _successor(prediction, sample, obs, action, key, spec)
-
-
-def predict_mean(
-    model: Model,
-    obs: Float[Array, "*batch O"],
-    action: Float[Array, "*batch A"],
-    key: PRNGKeyArray,
-    *,
-    net: networks.GaussianMLP,
-    spec: EnvSpec,
-) -> Successor:
-    """As `predict`, with the mean of (s', r); a learned end of the episode is drawn all the same."""
-    prediction = forward(model, obs, action, net=net)
-    return _successor(prediction, prediction.mean, obs, action, key, spec)
-
-
-def _successor(
-    prediction: networks.Prediction, change: jax.Array, obs: jax.Array, action: jax.Array, key: jax.Array, spec: EnvSpec
-) -> Successor:
-    """change: (Δs, r) [..., O + 1]."""
-    next_obs, reward = obs + change[..., :-1], change[..., -1]
-    if spec.terminated is None:
-        probability = jax.nn.sigmoid(prediction.logit)
-        return Successor(next_obs, reward, jax.random.bernoulli(jax.random.fold_in(key, 1), probability))
-    return Successor(next_obs, reward, spec.terminated(obs, action, next_obs))
+    outputs = prediction.mean
+    if sampled:
+        outputs += jnp.exp(0.5 * prediction.log_variance) * jax.random.normal(key, outputs.shape)
+    next_obs, reward = obs + outputs[..., :-1], outputs[..., -1]
+    if spec.terminated is not None:
+        return Successor(next_obs, reward, spec.terminated(obs, action, next_obs))
+    terminates = jax.random.bernoulli(jax.random.fold_in(key, 1), jax.nn.sigmoid(prediction.logit))
+    return Successor(next_obs, reward, terminates)
 
 
 def negative_log_likelihood(

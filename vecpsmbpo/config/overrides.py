@@ -50,14 +50,14 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
             algorithms += [str(value)] if name == "algo" else []
     if "experiment" in found and not sweep:
         raise SettingError(f"experiment={found['experiment']}: is a grid of runs and needs -m")
-    check_env_options(found)
+    _check_env_options(found)
     if sweep and "experiment" not in found:
         for algo in algorithms or [default("algo")]:
             check_algorithm(algo, found)
     return found
 
 
-def check_env_options(found: dict[str, Any]) -> None:
+def _check_env_options(found: dict[str, Any]) -> None:
     """That the task has the options given; a run that is resumed knows its task by itself."""
     given = [name for name in found if name.startswith("env.")]
     if "env" not in found and "run_dir" in found:
@@ -93,6 +93,7 @@ def _sweep_values(override: Override) -> list[Any]:
 
 
 def check_override(name: str, value: Any) -> Any:
+    """`value` as the type of what `name` says, a setting or a group."""
     if name in (*GROUPS, "experiment"):
         if value not in options(name):
             raise SettingError(f"{name}={value}: {closest(str(value), options(name))}")
@@ -107,4 +108,5 @@ def check_override(name: str, value: Any) -> Any:
 
 
 def first_line(error: Exception) -> str:
+    """Of what an error says."""
     return (str(error).strip() or repr(error)).splitlines()[0]

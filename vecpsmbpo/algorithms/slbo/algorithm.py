@@ -92,7 +92,8 @@ class Slbo(Algorithm):
         SLBO's code starts them from the environment's initial states, which a model cannot draw.
         """
         settings, spec = self.settings, self.spec
-        net, count, length = self.model_net, settings.policy_rollouts, settings.policy_rollout_length
+        count, length = settings.policy_rollouts, settings.policy_rollout_length
+        predict = partial(dynamics.predict, net=self.model_net, spec=spec, sampled=False)
 
         def real_states(key):
             return imagination.start_states(real, counters.env_steps, key, count, spec)
@@ -104,7 +105,7 @@ class Slbo(Algorithm):
             t, key = xs
             action_key, model_key, fresh_key = jax.random.split(key, 3)
             action = self.nets.policy.distribution(policy, seen(obs)).sample(action_key)
-            answer = dynamics.predict_mean(model, obs, jnp.clip(action, -1.0, 1.0), model_key, net=net, spec=spec)
+            answer = predict(model, obs, jnp.clip(action, -1.0, 1.0), model_key)
             ended = answer.terminated | (t == length - 1)
             terminated = answer.terminated.astype(jnp.float32)
             row = trpo.Rollouts(seen(obs), action, answer.reward, seen(answer.next_obs), terminated, ended)
