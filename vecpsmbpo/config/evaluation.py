@@ -1,20 +1,30 @@
-"""What `vecpsmbpo eval` and `Run.evaluate` may be told of a run."""
+"""`vecpsmbpo eval`: whole episodes of the run in `run_dir=`, or of the policy that export has written there.
+
+What is not said is as the run has it.
+"""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from vecpsmbpo.algorithms.catalogue import allowed, check
 from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import SettingError, Settings
 
-# By name, the setting that it stands for.
+
+class Word(NamedTuple):
+    """What may be told of an evaluation: the setting of the run that it stands for, and what it is for, in words."""
+
+    setting: str
+    what: str
+
+
 EVALUATION = {
-    "episodes": "eval_episodes",
-    "policy": "eval_policy",
-    "actions": "eval_actions",
-    "backend": "backend",
-    "devices": "devices",
+    "episodes": Word("eval_episodes", "of every seed and swept value"),
+    "policy": Word("eval_policy", "whose: drawn now, the one of highest mean return, or the average of all"),
+    "actions": Word("eval_actions", "of its action distribution"),
+    "backend": Word("backend", "what the episodes are stepped with"),
+    "devices": Word("devices", "how many to use; 0: every one that can be given work"),
 }
 
 
@@ -48,7 +58,7 @@ def for_evaluation(stored: Settings, given: Mapping[str, Any]) -> Settings:
     for name, value in given.items():
         if name not in EVALUATION:
             raise SettingError(f"{name}={value}: evaluation takes {', '.join(EVALUATION)}")
-        setting = EVALUATION[name]
+        setting = EVALUATION[name].setting
         try:
             changes[setting] = check(setting, value)
         except SettingError:
