@@ -4,7 +4,7 @@ drawn all the same, under the name that it has in the log."""
 from typing import NamedTuple
 
 
-class Number(NamedTuple):
+class Quantity(NamedTuple):
     """One of them.
 
     Attributes:
@@ -20,32 +20,34 @@ class Number(NamedTuple):
     always: bool = False
 
 
-NUMBERS = {
-    "env_steps": Number("environment steps"),
-    "seconds": Number("seconds"),
-    "eval_return": Number("evaluation return"),
-    "train_return": Number("return in training"),
-    "eval_length": Number("length of evaluation episodes"),
-    "real_ratio": Number(
+QUANTITIES = {
+    "env_steps": Quantity("environment steps"),
+    "seconds": Quantity("seconds"),
+    "eval_return": Quantity("evaluation return"),
+    "train_return": Quantity("return in training"),
+    "eval_length": Quantity("length of evaluation episodes"),
+    "real_ratio": Quantity(
         "λ, the share of real data", "λ: the share of real rows in what policies learn from", "share", always=True
     ),
-    "real_ratio_probs": Number("probability of each λ"),
-    "temperature": Number("temperature τ", always=True),
-    "critic_loss": Number("critic loss", "critic loss", "log", always=True),
-    "actor_loss": Number("actor loss", "actor loss", always=True),
-    "alpha": Number("SAC's entropy coefficient α", "α: SAC's entropy coefficient", always=True),
-    "entropy": Number("policy entropy", "entropy of the policies", always=True),
-    "q_mean": Number("mean Q", "mean Q of what is learned from", always=True),
-    "model_loss": Number("model loss (negative log-likelihood)", "negative log-likelihood of the models (equation 17)"),
-    "model_val_mse": Number("model validation error", "validation error of the models", "log"),
-    "env_steps_per_s": Number(
+    "real_ratio_probs": Quantity("probability of each λ"),
+    "temperature": Quantity("temperature τ", always=True),
+    "critic_loss": Quantity("critic loss", "critic loss", "log", always=True),
+    "actor_loss": Quantity("actor loss", "actor loss", always=True),
+    "alpha": Quantity("SAC's entropy coefficient α", "α: SAC's entropy coefficient", always=True),
+    "entropy": Quantity("policy entropy", "entropy of the policies", always=True),
+    "q_mean": Quantity("mean Q", "mean Q of what is learned from", always=True),
+    "model_loss": Quantity(
+        "model loss (negative log-likelihood)", "negative log-likelihood of the models (equation 17)"
+    ),
+    "model_val_mse": Quantity("model validation error", "validation error of the models", "log"),
+    "env_steps_per_s": Quantity(
         "environment steps per second", "environment steps per second, all seeds together", "log"
     ),
-    "updates_per_s": Number("updates per second", "SAC updates per second, all members together"),
-    "imagined_per_s": Number("imagined steps per second"),
+    "updates_per_s": Quantity("updates per second", "SAC updates per second, all members together"),
+    "imagined_per_s": Quantity("imagined steps per second"),
 }
 
 
-def of(name: str) -> Number:
+def of(name: str) -> Quantity:
     """What is known of the number that the log calls `name`."""
-    return NUMBERS.get(name, Number(name))
+    return QUANTITIES.get(name, Quantity(name))

@@ -19,7 +19,7 @@ from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
 SESSIONS_FILE = "sessions.jsonl"
-ALWAYS = tuple(name for name, number in logged.NUMBERS.items() if number.always)
+ALWAYS = tuple(name for name, quantity in logged.QUANTITIES.items() if quantity.always)
 read = jsonl.read
 
 

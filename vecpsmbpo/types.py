@@ -161,7 +161,7 @@ class Posterior(struct.PyTreeNode):
 
 
 class Bandit(struct.PyTreeNode):
-    """What is known of the K values of λ to choose from (`mixture`).
+    """What is known of the K values of λ to choose from (`mixing`).
 
     Attributes:
         excess, counts: [K], sum of returns above `lowest`, and number, of each arm's episodes, older ones discounted.

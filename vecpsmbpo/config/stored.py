@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from vecpsmbpo import recorded, whole
+from vecpsmbpo import atomic, recorded
 from vecpsmbpo.algorithms.catalogue import build
 from vecpsmbpo.config.choices import defaults
 from vecpsmbpo.config.overrides import check_env_values, check_override, first_line
@@ -19,7 +19,7 @@ def save(settings: Settings, run_dir: Path) -> None:
     """Writes `config.yaml`: not with whom it was run, which is over when it ends."""
     plain = recorded.plain(dataclasses.replace(settings, distributed=""))
     # At once: a run whose config is cut short could not be resumed.
-    whole.write_text(run_dir / CONFIG_FILE, yaml.safe_dump(plain, sort_keys=False))
+    atomic.write_text(run_dir / CONFIG_FILE, yaml.safe_dump(plain, sort_keys=False))
 
 
 def load(run_dir: str | Path) -> Settings:

@@ -167,7 +167,7 @@ def _add_run(page: "Page", run: Run, heading: str, diagnosis: dict[str, Any] | N
     if max(len(one.lanes) for one in groups.group([run])) > 1:
         page.add('<p class="soft">Thick lines are means over seeds, thin ones the seeds.</p>')
     _add_posterior(page, run)
-    pictures = [_lanes_picture(page, run, y) for y, number in logged.NUMBERS.items() if number.caption]
+    pictures = [_lanes_picture(page, run, y) for y, quantity in logged.QUANTITIES.items() if quantity.caption]
     page.add("<h3>Inside</h3>", html.panels(filter(None, (*pictures, _chances_picture(page, run)))))
     if diagnosis is not None:
         _add_diagnosis(page, diagnosis)
@@ -253,16 +253,16 @@ def _lanes_picture(page: "Page", run: Run, y: str) -> str:
     for look, line in zip(looks, curves, strict=True):
         style.threads(axes, look, line.x, line.seeds)
         style.line(axes, look, line.x, line.y, label=line.name)
-    number = logged.of(y)
-    if number.scale == "share":
+    quantity = logged.of(y)
+    if quantity.scale == "share":
         axes.set_ylim(-0.03, 1.03)
-    elif number.scale == "log" and min(line.seeds.min() for line in curves if line.seeds.size) > 0:
+    elif quantity.scale == "log" and min(line.seeds.min() for line in curves if line.seeds.size) > 0:
         axes.set_yscale("log")
     style.steps_axis(axes, STEPS)
-    axes.set_ylabel(number.label)
+    axes.set_ylabel(quantity.label)
     if len(curves) > 1:
         style.legend(figure, axes, columns=3)
-    return page.picture(figure, number.caption or number.label)
+    return page.picture(figure, quantity.caption or quantity.label)
 
 
 def _chances_picture(page: "Page", run: Run) -> str:

@@ -77,7 +77,7 @@ class Settings:
         return " ".join([self.env, *(str(value) for _, value in self.env_options)])
 
     @property
-    def scale(self) -> str:
+    def summary(self) -> str:
         """How much learns, in words."""
         return f"N = {self.n_models} model(s)"
 

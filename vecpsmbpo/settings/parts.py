@@ -61,7 +61,7 @@ class ImaginationSettings(SacSettings):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PosteriorSettings(Settings):
-    """Of `posterior` and `mixture`: who acts, and from how much real data each learns."""
+    """Of `posterior` and `mixing`: who acts, and from how much real data each learns."""
 
     n_policies: int = whole(1)
     real_ratio: float = real(0, 1, traced=True)

@@ -165,7 +165,7 @@ class _Session:
         swept = "".join(f"{len(values)} values of {name} × " for name, values in settings.sweep)
         self.display.say(
             f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × {swept}"
-            f"{settings.scale}, on {layout.mesh.size} {jax.default_backend()} device(s)"
+            f"{settings.summary}, on {layout.mesh.size} {jax.default_backend()} device(s)"
         )
         self.display.say(f"memory: {self.memory}")
         where = f"resuming at step {self.env_steps}" if self.env_steps else "starting"

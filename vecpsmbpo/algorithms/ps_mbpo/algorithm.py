@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vecpsmbpo import health, imagination, mixture, posterior, replay, sac
+from vecpsmbpo import health, imagination, mixing, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
 from vecpsmbpo.sac import Agent
@@ -64,13 +64,13 @@ class PsMbpo(Algorithm):
             state = state.replace(episode=state.episode.replace(values=unknown))
         else:
             starts = None
-        return state.replace(own=Evidence(starts, mixture.init(settings) if settings.adapts_real_ratio else None))
+        return state.replace(own=Evidence(starts, mixing.init(settings) if settings.adapts_real_ratio else None))
 
     def numbers(self, counters: Counters, state: SeedState) -> dict[str, Any]:
         """λ, of several members their mean, and τ; where λ is chosen online, how likely each is the best."""
         bandit = state.own.bandit
         ratio = np.asarray(self.real_ratios(counters, state), np.float64).mean()
-        chosen = {} if bandit is None else {"real_ratio_probs": mixture.probabilities(bandit)}
+        chosen = {} if bandit is None else {"real_ratio_probs": mixing.probabilities(bandit)}
         return {"real_ratio": ratio, "temperature": state.hyper.temperature, **chosen}
 
     # ── who acts: once an episode ────────────────────────────────────────────────────────────────────────────
@@ -84,8 +84,8 @@ class PsMbpo(Algorithm):
         """To the member (equation 19) and, where λ is chosen online, to the λ that it learned with."""
         bandit = state.own.bandit
         if bandit is not None:
-            arm = mixture.arms_of_members(self.settings, bandit)[state.episode.member]
-            credited = mixture.credit(bandit, arm, episode_return)
+            arm = mixing.arms_of_members(self.settings, bandit)[state.episode.member]
+            credited = mixing.credit(bandit, arm, episode_return)
             known = jax.tree.map(partial(jnp.where, counts), credited, bandit)
             state = state.replace(own=state.own.replace(bandit=known))
         return super().credit(state, episode_return, counts)
@@ -179,7 +179,7 @@ class PsMbpo(Algorithm):
 
     def real_ratios(self, counters: Counters, state: SeedState) -> jax.Array:
         """[N·M] the λ of each member now."""
-        return mixture.real_ratios(self.settings, state.hyper, state.own.bandit, counters.env_steps)
+        return mixing.real_ratios(self.settings, state.hyper, state.own.bandit, counters.env_steps)
 
     def refreshes(self, counters: Counters, state: SeedState) -> jax.Array:
         """Whether any member may learn from imagined data, [] bool, in the period that begins: λ may fall from 1 within
@@ -244,7 +244,7 @@ class PsMbpo(Algorithm):
 
         start = (state.imagined, jnp.ones(ids.shape, bool), counters.imagined_rows)
         imagined, sound, rows = jax.lax.fori_loop(0, chunks, rollout, start)
-        counters = counters._replace(imagined_rows=replay.count(rows, self.ring_capacity))
+        counters = counters._replace(imagined_rows=replay.wrapped(rows, self.ring_capacity))
         sound |= ids >= layout.n_members
         first = layout.least_of_members(jnp.min(jnp.where(sound, layout.n_members, ids)))
         noted = health.note(state.health, health.IMAGINED, first < layout.n_members, first)

@@ -11,7 +11,7 @@ class PsMbpoSettings(PosteriorSettings, ImaginationSettings):
     """Policies that learn by SAC from real and imagined data."""
 
     @property
-    def scale(self) -> str:
+    def summary(self) -> str:
         where = " in all of them" if self.rollout_models == "any" else ""
         members = f"N = {self.n_models} models × M = {self.n_policies} policies{where}"
         return f"{members}, {self.updates_per_step} updates per step"
