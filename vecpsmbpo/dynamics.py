@@ -17,7 +17,7 @@ VALIDATION_BATCH = 512
 
 
 class Split(NamedTuple):
-    """A random split of the first `rows` rows of D_E into training and validation.
+    """A random split of the first `added` rows of D_E into training and validation.
 
     Of every k consecutive rows, row `offset` of that block validates and the other k - 1 train. This is exactly
     1/k of the data, drawn anew at every refit, and needs no permutation of a data set whose size is traced; the
@@ -32,9 +32,9 @@ class Split(NamedTuple):
     blocks: jax.Array
 
     @classmethod
-    def draw(cls, key: PRNGKeyArray, rows: Whole, capacity: int, block: int) -> "Split":
+    def draw(cls, key: PRNGKeyArray, added: Whole, capacity: int, block: int) -> "Split":
         offset = jax.random.randint(key, (-(-capacity // block),), 0, block)
-        return cls(offset, jnp.minimum(rows, capacity) // block)
+        return cls(offset, jnp.minimum(added, capacity) // block)
 
     def train_rows(self, key: PRNGKeyArray, batch: int, block: int) -> Int[Array, " {batch}"]:
         """Indices of training rows, uniform with replacement."""
@@ -74,13 +74,13 @@ def init(key: PRNGKeyArray, hyper: Hyper, settings: Settings, spec: EnvSpec) -> 
     return Model(params, optim.init(params), plain, loss=zero, val_mse=zero, prior=prior)
 
 
-def scaling(moments: Moments, rows: Whole, settings: Settings) -> Scaling:
+def scaling(moments: Moments, added: Whole, settings: Settings) -> Scaling:
     """What whitens the inputs (equation 20) and, with `whiten_targets`, the outputs: changes Δs and rewards.
 
     What has never varied is left unscaled: there is nothing to learn of it yet, and dividing by a vanishing deviation
     would turn its first change into an explosion.
     """
-    std = jnp.sqrt(moments.deviation / jnp.maximum(rows, 1))
+    std = jnp.sqrt(moments.deviation / jnp.maximum(added, 1))
     std = jnp.where(std > 1e-6, std, 1.0)
     size = moments.inputs
     outputs = std[size:] if settings.whiten_targets else jnp.ones_like(std[size:])

@@ -136,7 +136,7 @@ def predict_with_any(
 
 
 def start_states(
-    real: Float[Array, "C F"], rows: Whole, key: PRNGKeyArray, count: int, spec: EnvSpec
+    real: Float[Array, "C F"], added: Whole, key: PRNGKeyArray, count: int, spec: EnvSpec
 ) -> Float[Array, "{count} O"]:
     """Observations drawn uniformly from D_E."""
-    return real[replay.sample_indices(key, (count,), rows, real.shape[0]), : spec.obs_size]
+    return real[replay.sample_indices(key, (count,), added, real.shape[0]), : spec.obs_size]

@@ -102,9 +102,9 @@ class Algorithm(ABC):
         """Who acts in the episode that begins, [] int, and the distribution [N·M] that it was drawn from."""
         return jnp.int32(0), jnp.ones(self.settings.n_members)
 
-    def credit(self, state: SeedState, episode_return: jax.Array, counts: jax.Array) -> SeedState:
-        """What the episode that ends earned, [], where `counts`: added to what is known of the member that acted."""
-        credited = posterior.credit(state.posterior, state.episode.member, episode_return, counts)
+    def credit(self, state: SeedState, episode_return: jax.Array, enabled: jax.Array) -> SeedState:
+        """What the episode that ends earned, [], where `enabled`: added to what is known of the member that acted."""
+        credited = posterior.credit(state.posterior, state.episode.member, episode_return, enabled)
         return state.replace(posterior=credited)
 
     def refreshes(self, counters: Counters, state: SeedState) -> jax.Array:
@@ -265,9 +265,9 @@ class Algorithm(ABC):
         """Refits every model on D_E (Algorithm 1, line 2) where `enabled`."""
         settings, spec = self.settings, self.spec
         split_key, fit_key = jax.random.split(key)
-        rows = counters.env_steps
-        split = dynamics.Split.draw(split_key, rows, settings.replay_capacity, settings.validation_block)
-        whitening = dynamics.scaling(state.moments, rows, settings)
+        added = counters.env_steps
+        split = dynamics.Split.draw(split_key, added, settings.replay_capacity, settings.validation_block)
+        whitening = dynamics.scaling(state.moments, added, settings)
 
         def fit(model, key, real, split, whitening, hyper):
             return dynamics.fit(model, real, split, whitening, hyper, key, settings=settings, spec=spec)
@@ -286,12 +286,12 @@ def _no_moments(inputs: int, obs_size: int) -> Moments:
     return Moments(zeros, zeros, lowest_reward=zero, highest_reward=zero, inputs=inputs)
 
 
-def _welford(moments: Moments, transition: Transition, rows: jax.Array) -> Moments:
-    """Moments of one more row after `rows` of them."""
+def _welford(moments: Moments, transition: Transition, added: jax.Array) -> Moments:
+    """Moments of one more row after `added` of them."""
     obs, action, reward, next_obs, _ = transition
     value = jnp.concatenate([obs, action, next_obs - obs, reward[None]])
     change = value - moments.mean
-    mean = moments.mean + change / (rows + 1)
+    mean = moments.mean + change / (added + 1)
     return moments.replace(
         mean=mean,
         deviation=moments.deviation + change * (value - mean),

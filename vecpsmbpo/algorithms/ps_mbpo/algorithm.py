@@ -80,15 +80,15 @@ class PsMbpo(Algorithm):
         member, probs = posterior.draw(posterior.logits(members, values, hyper.temperature), key)
         return jnp.int32(-1) if self.settings.averages_members else member, probs
 
-    def credit(self, state: SeedState, episode_return: jax.Array, counts: jax.Array) -> SeedState:
+    def credit(self, state: SeedState, episode_return: jax.Array, enabled: jax.Array) -> SeedState:
         """To the member (equation 19) and, where λ is chosen online, to the λ that it learned with."""
         bandit = state.own.bandit
         if bandit is not None:
             arm = mixing.arms_of_members(self.settings, bandit)[state.episode.member]
             credited = mixing.credit(bandit, arm, episode_return)
-            known = jax.tree.map(partial(jnp.where, counts), credited, bandit)
+            known = jax.tree.map(partial(jnp.where, enabled), credited, bandit)
             state = state.replace(own=state.own.replace(bandit=known))
-        return super().credit(state, episode_return, counts)
+        return super().credit(state, episode_return, enabled)
 
     def note_start(self, state: SeedState, obs: jax.Array) -> SeedState:
         starts = posterior.add_start(state.own.starts, state.episode, obs)
@@ -227,24 +227,24 @@ class PsMbpo(Algorithm):
             return replay.pack(transition), jnp.where(transition.terminated[:, None], fresh, transition.next_obs)
 
         def step(t, carry):
-            imagined, sound, obs, rows, key = carry
+            imagined, sound, obs, added, key = carry
             keys = jax.vmap(jax.random.split)(layout.keys(jax.random.fold_in(key, t), ids))
             fresh = real_states(keys[:, 1])
-            rows_now, obs = layout.map_local(advance, models, state.agents.actor, obs, fresh, keys[:, 0])
-            finite = jnp.all(jnp.isfinite(rows_now), axis=-1)
-            imagined = replay.add(imagined, jnp.where(finite[..., None], rows_now, 0.0), rows)
-            return imagined, sound & jnp.all(finite, axis=-1), obs, rows + chunk, key
+            rows, obs = layout.map_local(advance, models, state.agents.actor, obs, fresh, keys[:, 0])
+            finite = jnp.all(jnp.isfinite(rows), axis=-1)
+            imagined = replay.add(imagined, jnp.where(finite[..., None], rows, 0.0), added)
+            return imagined, sound & jnp.all(finite, axis=-1), obs, added + chunk, key
 
         def rollout(c, carry):
-            imagined, sound, rows = carry
+            imagined, sound, added = carry
             start_key, step_key = jax.random.split(jax.random.fold_in(key, c))
             obs = real_states(layout.keys(start_key, ids))
-            imagined, sound, _, rows, _ = jax.lax.fori_loop(0, horizon, step, (imagined, sound, obs, rows, step_key))
-            return imagined, sound, rows
+            imagined, sound, _, added, _ = jax.lax.fori_loop(0, horizon, step, (imagined, sound, obs, added, step_key))
+            return imagined, sound, added
 
         start = (state.imagined, jnp.ones(ids.shape, bool), counters.imagined_rows)
-        imagined, sound, rows = jax.lax.fori_loop(0, chunks, rollout, start)
-        counters = counters._replace(imagined_rows=replay.wrapped(rows, self.ring_capacity))
+        imagined, sound, added = jax.lax.fori_loop(0, chunks, rollout, start)
+        counters = counters._replace(imagined_rows=replay.wrapped(added, self.ring_capacity))
         sound |= ids >= layout.n_members
         first = layout.least_of_members(jnp.min(jnp.where(sound, layout.n_members, ids)))
         noted = health.note(state.health, health.IMAGINED, first < layout.n_members, first)

@@ -56,12 +56,12 @@ class Slbo(Algorithm):
         fit = partial(multistep.fit, net=self.model_net, settings=self.settings, spec=self.spec)
 
         def learn(model, agent, key, counters, real, whitening, hyper):
-            rows = counters.env_steps
+            added = counters.env_steps
 
             def round_(learned, key):
                 model, agent = learned
                 model_key, policy_key = jax.random.split(key)
-                model = fit(model, real, rows, hyper, model_key)
+                model = fit(model, real, added, hyper, model_key)
 
                 def policy_step(agent, key):
                     rollout_key, update_key = jax.random.split(key)
