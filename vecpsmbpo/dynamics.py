@@ -219,8 +219,8 @@ def fit(
         batch = rows_of(split.train_rows(key, settings.model_batch_size, block))
         objective = lambda params: loss(model.replace(params=params), batch, net=net)  # noqa: E731
         value, gradient = jax.value_and_grad(objective)(params)
-        gradient = jax.tree.map(partial(optim.with_decay, hyper.model_weight_decay), gradient, params)
-        return *optim.step(gradient, optimizer, params, hyper.model_learning_rate), value
+        rate, decay = hyper.model_learning_rate, hyper.model_weight_decay
+        return *optim.step(gradient, optimizer, params, rate, decay=decay), value
 
     def validate(params: Params) -> jax.Array:
         return validation_error(model.replace(params=params), rows_of, split, block, net=net)

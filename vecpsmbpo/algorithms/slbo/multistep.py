@@ -1,7 +1,5 @@
 """SLBO's fit of ONE dynamics model (Luo et al., 2019, section 4): several steps ahead, in a norm not squared."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import optax
@@ -78,8 +76,7 @@ def fit(
         batch, follows = sequences(real, added, key, settings, spec)
         objective = lambda params: loss(model.replace(params=params), batch, follows, net=net)  # noqa: E731
         value, gradient = jax.value_and_grad(objective)(params)
-        gradient = jax.tree.map(partial(optim.with_decay, hyper.model_weight_decay), gradient, params)
-        return optim.step(gradient, optimizer, params, hyper.model_learning_rate), value
+        return optim.step(gradient, optimizer, params, hyper.model_learning_rate, decay=hyper.model_weight_decay), value
 
     start = model.params, model.optimizer
     (params, optimizer), losses = jax.lax.scan(step, start, jax.random.split(key, settings.model_steps))
