@@ -141,7 +141,8 @@ def epoch_lines(state: TrainState, algorithm: Algorithm) -> list[Line]:
     stats = {name: np.asarray(value) for name, value in vars(seeds.agents.stats).items()}
     updates = stats.pop("updates")
     fitted = np.asarray(seeds.models.optimizer.count)[:, 0] > 0
-    small = seeds.replace(models=None, agents=None, real=None, imagined=None)
+    rest = seeds.replace(key=None, models=None, agents=None, real=None, imagined=None)
+    rest = jax.tree.map(np.asarray, rest)  # of which a lane's part is a view
     lines = []
     for seed in range(len(settings.lanes)):
         episodes = float(seeds.epoch_episodes[seed])
@@ -151,7 +152,7 @@ def epoch_lines(state: TrainState, algorithm: Algorithm) -> list[Line]:
         }
         agents = {name: value[seed] / np.maximum(updates[seed], 1) for name, value in stats.items()}
         learned = updates[seed, 0] > 0
-        own = algorithm.numbers(state.counters, jax.tree.map(lambda x, seed=seed: x[seed], small))
+        own = algorithm.numbers(state.counters, jax.tree.map(lambda x, seed=seed: x[seed], rest))
         lines.append(
             {
                 "env_steps": int(state.counters.env_steps),
@@ -162,10 +163,7 @@ def epoch_lines(state: TrainState, algorithm: Algorithm) -> list[Line]:
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
                 **dict.fromkeys(ALWAYS),
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
-                **{
-                    name: np.asarray(value).tolist() if np.ndim(value) else _number(value)
-                    for name, value in own.items()
-                },
+                **{name: _plain(value) for name, value in own.items()},
             }
         )
     return lines
@@ -176,9 +174,9 @@ def _lane(settings: Settings, index: int) -> Line:
     return {name: _number(value) for name, value in settings.lanes[index].items()}
 
 
-def _list(values: Any) -> list[float]:
-    found: list[float] = np.asarray(values).tolist()
-    return found
+def _plain(value: Any) -> Any:
+    """A number, or a list of them, in JSON's types."""
+    return np.asarray(value).tolist() if np.ndim(value) else _number(value)
 
 
 def _number(value: Any) -> int | float | str:

@@ -91,7 +91,7 @@ class Algorithm(ABC):
 
     def numbers(self, counters: Counters, state: SeedState) -> dict[str, Any]:
         """What it has to say in an epoch's line of metrics.jsonl besides the members' `stats`: numbers, and lists of
-        them, by name. Called on the host, with a state without models, agents and rings."""
+        them, by name. Called on the host, with NumPy arrays, and without key, models, agents and rings."""
         return {}
 
     def values(self, state: SeedState) -> jax.Array | None:
