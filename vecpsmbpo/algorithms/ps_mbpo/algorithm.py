@@ -147,8 +147,8 @@ class PsMbpo(Algorithm):
             q = jnp.minimum(*nets.critic.values(agent.critic, starts, action))
             return jnp.sum(jnp.where(known, q, 0.0)) / jnp.sum(known)
 
-        limits = sac.Limits(moments.lowest_reward, moments.highest_reward)
-        least, most = sac.target_range(limits, jnp.float32(0.0), state.hyper, self.spec.action_size)
+        reward_range = sac.RewardRange(moments.lowest_reward, moments.highest_reward)
+        least, most = sac.target_range(reward_range, jnp.float32(0.0), state.hyper, self.spec.action_size)
         return jnp.clip(self.layout.all_members(jax.vmap(value)(state.agents)), least, most)
 
     def _of_member(
@@ -268,17 +268,15 @@ class PsMbpo(Algorithm):
         batches, noise = layout.part((batches, noise), axis=2)
 
         moments = state.moments
-        limits = sac.Limits(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
+        reward_range = sac.RewardRange(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
         rate = sac.learning_rate(settings, state.hyper.policy_learning_rate, counters.env_steps)
         hyper = state.hyper.replace(policy_learning_rate=rate)
 
-        def update(agent, batches, noise, hyper, limits):
-            every = settings.target_update_every
-            return sac.updates(
-                agent, batches, noise, hyper, nets=nets, limits=limits, target_every=every, mean=layout.mean_of_parts
-            )
+        def update(agent, batches, noise, hyper, reward_range):
+            how = {"target_every": settings.target_update_every, "mean": layout.mean_of_parts}
+            return sac.updates(agent, batches, noise, hyper, nets=nets, reward_range=reward_range, **how)
 
-        return layout.map_local(update, state.agents, batches, noise, shared=(hyper, limits))
+        return layout.map_local(update, state.agents, batches, noise, shared=(hyper, reward_range))
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings
