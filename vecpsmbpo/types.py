@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from vecpsmbpo.algorithms.catalogue import TRACED
 from vecpsmbpo.settings import Settings
 
 # Signatures give shapes in these letters, `*batch` for any leading axes: Float[Array, "*batch O"]. Others (H, K, D) are
@@ -62,8 +63,8 @@ class Transition(NamedTuple):
 
 @jax.tree_util.register_pytree_with_keys_class
 class Hyper:
-    """What may be swept as a number: a leaf for each setting of the algorithm that is marked `traced`, by its name.
-    Scalars here and [S] in a train state."""
+    """What may be swept as a number: every setting that is marked `traced`, by its name. Scalars here and [S] in a
+    train state; None, and no leaf, where the algorithm has no such setting."""
 
     def __init__(self, **values: Any):
         vars(self).update(values)
@@ -74,7 +75,8 @@ class Hyper:
 
     @classmethod
     def of(cls, settings: Settings) -> "Hyper":
-        return cls(**{name: jnp.float32(getattr(settings, name)) for name in settings.traced})
+        values = {name: getattr(settings, name, None) for name in TRACED}
+        return cls(**{name: None if value is None else jnp.float32(value) for name, value in values.items()})
 
     def replace(self, **values: Any) -> "Hyper":
         return Hyper(**{**vars(self), **values})

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from vecpsmbpo.settings.fields import choice, is_traced, real, whole
+from vecpsmbpo.settings.fields import choice, real, whole
 
 Options = tuple[tuple[str, Any], ...]  # name and value of each `env.*` option, in the order of names
 Sweep = tuple[tuple[str, tuple[float, ...]], ...]  # name and values of each `sweep.*`, in the order of names
@@ -123,12 +123,6 @@ class Settings:
         names = [name for name, _ in self.sweep]
         points = itertools.product(*(values for _, values in self.sweep))
         return tuple({**seed, **dict(zip(names, point, strict=True))} for point in points for seed in seeds)
-
-    @property
-    def traced(self) -> tuple[str, ...]:
-        """The settings that are numbers inside the compiled program (`types.Hyper`), as they are declared: that order
-        is also one of leaves in checkpoints, which cannot be read with another."""
-        return tuple(field.name for field in dataclasses.fields(self) if is_traced(field))
 
     @property
     def has_prior(self) -> bool:
