@@ -11,7 +11,7 @@ from typing import Any
 from beartype import beartype
 from jaxtyping import jaxtyped
 
-CORE = ("sac", "networks", "dynamics", "replay", "posterior", "mixture", "imagination")
+CORE = ("sac", "networks", "dynamics", "replay", "posterior", "mixing", "imagination")
 ALGORITHMS = ("pets.planning", "slbo.trpo", "slbo.multistep", "slbo.networks")
 
 

@@ -150,6 +150,13 @@ def test_a_command_s_help_names_its_options(command, capsys):
     assert max(map(len, shown.splitlines())) <= 120
 
 
+def test_the_help_of_eval_names_what_it_may_be_told(capsys):
+    assert cli.main(["eval", "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("`vecpsmbpo eval`")
+    assert re.findall(r"^  (\w+)=", shown, re.MULTILINE) == ["episodes", "policy", "actions", "backend", "devices"]
+
+
 def test_version_says_what_a_report_needs_without_jax(tmp_path):
     program = [sys.executable, "-c", WITHOUT_JAX, "--version"]
     result = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=60)

@@ -116,8 +116,8 @@ def test_calibration_of_a_normal_world(believed):
     """With σ_model = c σ, the central interval of level p holds 2 Φ(c z) - 1 of what happens."""
     seen = _windows(0.9, 0.2, 20_000)
     models = _together(_linear_model(0.9, 1.0, 0.2 * believed))
-    surprises = diagnostics.surprise(models, seen.obs, seen.action[:, 0], seen.truth[:, 0], net=NET)
-    found = diagnostics.calibration(np.asarray(surprises))
+    residuals = diagnostics.residuals(models, seen.obs, seen.action[:, 0], seen.truth[:, 0], net=NET)
+    found = diagnostics.calibration(np.asarray(residuals))
     for index, level in enumerate(diagnostics.LEVELS):
         expected = 2 * norm.cdf(believed * norm.ppf(0.5 + level / 2)) - 1
         np.testing.assert_allclose(found.coverage[0, index], expected, atol=0.01)
@@ -144,12 +144,12 @@ def test_the_return_of_a_constant_reward():
     discount, steps = 0.9, 60
     found = diagnostics.returns(_constant(1.0, steps), discount, np.zeros(1))[0]
     np.testing.assert_allclose(found, (1 - discount ** np.arange(steps, 0, -1)) / (1 - discount))
-    known = diagnostics.told(_constant(1.0, steps), discount)[0]
+    known = diagnostics.known(_constant(1.0, steps), discount)[0]
     assert known.sum() == steps - diagnostics.tail(discount) + 1
     np.testing.assert_allclose(found[known], 10, rtol=diagnostics.TAIL)
     ended = _constant(1.0, steps, ends_at=3)
     np.testing.assert_allclose(diagnostics.returns(ended, discount, np.zeros(1))[0, :5], [3.439, 2.71, 1.9, 1, 0])
-    np.testing.assert_array_equal(diagnostics.told(ended, discount)[0], np.arange(steps) <= 3)
+    np.testing.assert_array_equal(diagnostics.known(ended, discount)[0], np.arange(steps) <= 3)
 
 
 def test_the_entropy_of_later_actions_is_earned_as_well():

@@ -77,8 +77,8 @@ def _by_enumeration(sequences):
 def test_trajectory_sampling_against_enumeration(kept, sequences, key):
     """TS∞: every particle in one model. TS1: every sequence of models is equally likely."""
     settings = tiny(algo="pets", n_models=2, plan_particles=4, plan_horizon=2, plan_hold=2, rollout_models=kept)
-    plans = jnp.zeros((3000, 2, 1))
-    returns = planning.expected_returns(_counters(settings), jnp.zeros(1), plans, key, settings=settings, spec=SPEC)
+    models, plans, net = _counters(settings), jnp.zeros((3000, 2, 1)), dynamics.network(settings, SPEC)
+    returns = planning.expected_returns(models, jnp.zeros(1), plans, key, net=net, settings=settings, spec=SPEC)
     noise = float(4 * np.std(returns) / np.sqrt(len(returns)) + 0.05)  # the models' own noise is tiny
     assert float(returns.mean()) == pytest.approx(_by_enumeration(sequences), abs=noise)
 
@@ -99,7 +99,8 @@ def test_each_action_is_held_and_reaches_the_model(key):
     params["Dense_1"]["bias"] = jnp.array([-100.0, -100.0, -1e3, -1e3])
     models = jax.tree.map(lambda x: jnp.stack([x, x]), model.replace(params={"params": params}))
     plans = jnp.array([[[0.5], [-0.2]], [[0.0], [0.0]]])
-    returns = planning.expected_returns(models, jnp.zeros(1), plans, key, settings=settings, spec=SPEC)
+    net = dynamics.network(settings, SPEC)
+    returns = planning.expected_returns(models, jnp.zeros(1), plans, key, net=net, settings=settings, spec=SPEC)
     states = np.cumsum([0, 0.5, 0.5, 0.5, -0.2, -0.2])  # before each of the six steps
     np.testing.assert_allclose(returns, [states.sum(), 0.0], atol=0.15)
 
@@ -141,7 +142,7 @@ def test_a_run_plans_well(kind):
     assert np.mean(planned[-10:]) > 0.8  # uniform actions: 2/3
     assert {(line["model"], line["policy"], len(line["probs"])) for line in lines} == {(0, 0, 1)}
     assert (driver.evaluate(state, evaluation_keys(settings, 0), 2).episode_return > 0.8).all()
-    line = metrics.epoch_lines(state, settings)[0]
+    line = metrics.epoch_lines(state, driver.algorithm)[0]
     assert line["critic_loss"] is None
     assert line["model_val_mse"] < 0.1
 

@@ -70,12 +70,12 @@ def test_the_range_of_targets_by_hand():
     # γ = 0.9: ten steps. Rewards in [-1, 2]; α = 0.5, two actions: a bonus of up to 0.9 · 0.5 · 2 log 2 a step, and of
     # 0.9 · 0.5 · (-3) at the target entropy.
     hyper = Hyper.of(tiny()).replace(discount=jnp.float32(0.9), target_entropy=jnp.float32(-3.0))
-    least, most = sac.target_range(sac.Limits(-1.0, 2.0), 0.5, hyper, 2)
+    least, most = sac.target_range(sac.RewardRange(-1.0, 2.0), 0.5, hyper, 2)
     assert most == pytest.approx(10 * (2 + 0.9 * np.log(2)), rel=1e-5)
     assert least == pytest.approx(10 * (-1 - 1.35), rel=1e-5)
     # Rewards of 1 to 2 only: an episode may end, and earn nothing more.
     hyper = hyper.replace(target_entropy=jnp.float32(1.0))
-    least, _ = sac.target_range(sac.Limits(1.0, 2.0), 0.5, hyper, 2)
+    least, _ = sac.target_range(sac.RewardRange(1.0, 2.0), 0.5, hyper, 2)
     assert least == 0
 
 

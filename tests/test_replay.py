@@ -37,7 +37,7 @@ def test_the_ring_keeps_the_newest_rows():
 def test_the_count_keeps_position_and_fullness_and_never_overflows():
     added = exact = 0
     for new in (3, 4, 5, 6, 7, 3, 9):
-        added, exact = int(replay.count(jnp.int32(added + new), 8)), exact + new
+        added, exact = int(replay.wrapped(jnp.int32(added + new), 8)), exact + new
         assert added % 8 == exact % 8
         assert min(added, 8) == min(exact, 8)
         assert added < 16

@@ -21,6 +21,7 @@ from vecpsmbpo import config, evaluate, jsonl, metrics, placement, recorded, tra
 from vecpsmbpo.envs.host.dm_control import DmControlSimulator
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.training import guards
+from vecpsmbpo.types import Hyper
 
 SMALL = ["env=cartpole_swingup", "size=tiny", "num_seeds=2", "total_steps=200"]
 
@@ -404,3 +405,20 @@ def test_log_files_drop_what_will_be_done_again(tmp_path):
     log.episodes([{"env_steps": 25, "seed": 0, "return": 2.0, "length": 5}])
     log.close()
     assert [line["env_steps"] for line in metrics.read(path)] == [10, 20, 25]
+
+
+@pytest.mark.parametrize(
+    ("algo", "own"),
+    [
+        ("ops_mbpo", "policy_learning_rate discount target_entropy target_update_rate real_ratio temperature"),
+        ("pets", ""),
+        ("slbo", "discount"),
+    ],
+)
+def test_what_may_be_swept_keeps_its_order_in_checkpoints(algo, own):
+    shared = "model_learning_rate model_weight_decay prior_scale forced_exploration"
+    everything = "policy_learning_rate discount target_entropy target_update_rate real_ratio temperature"
+    hyper = Hyper.of(tiny(algo=algo))
+    assert list(vars(hyper)) == f"{shared} {everything}".split()  # also of what the algorithm has not
+    leaves = jax.tree_util.tree_leaves_with_path(hyper)
+    assert [jax.tree_util.keystr(path) for path, _ in leaves] == [f".{name}" for name in f"{shared} {own}".split()]

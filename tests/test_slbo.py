@@ -168,7 +168,7 @@ def test_a_run_learns_the_probe(kind, terminates):
     driver = make_driver(kind, terminates, settings)
     state, news = driver.run(driver.init(*initial_inputs(settings)), settings.epoch_steps // settings.stride)
     assert (driver.evaluate(state, evaluation_keys(settings, 0), 2).episode_return > 0.9).all()
-    line = metrics.epoch_lines(state, settings)[0]
+    line = metrics.epoch_lines(state, driver.algorithm)[0]
     periods = (settings.total_steps - settings.warmup_steps) // settings.model_update_every
     assert float(state.seeds.agents.stats.updates[0, 0]) == periods * settings.rounds * settings.policy_steps
     assert line["model_loss"] < 0.2

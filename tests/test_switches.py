@@ -13,7 +13,7 @@ from tests import probes
 from tests.helpers import algorithm, assert_probabilities_follow, tiny
 from tests.test_drivers import make_driver, settings_for
 from tests.test_imagination import constant
-from vecpsmbpo import dynamics, metrics, mixture, posterior, sac
+from vecpsmbpo import dynamics, metrics, mixing, posterior, sac
 from vecpsmbpo.envs import specs
 from vecpsmbpo.training.programs import initial_inputs
 from vecpsmbpo.types import Bandit, Counters, Hyper
@@ -56,7 +56,7 @@ def test_the_prior_is_added_to_the_network_and_never_fitted(key):
 @pytest.mark.parametrize("mean", [0.05, 0.3, 0.5, 0.8])
 def test_the_linear_schedule_has_the_constant_s_area(mean):
     progress = jnp.linspace(0, 1, 100_001)
-    ratio = np.asarray(mixture.linear(jnp.float32(mean), progress))
+    ratio = np.asarray(mixing.linear(jnp.float32(mean), progress))
     assert np.trapezoid(ratio, progress) == pytest.approx(mean, abs=1e-3)
     assert ratio[0] == 1
     assert ratio[-1] == pytest.approx(0, abs=1e-6)
@@ -72,14 +72,14 @@ def test_of_a_run_s_updates_the_linear_schedule_uses_as_many_real_rows_as_the_co
         real_ratio_schedule="linear", real_ratio=mean, total_steps=12_000, warmup_steps=4_000, replay_capacity=5000
     )
     hyper, steps = Hyper.of(settings), jnp.arange(settings.first_learning_step, settings.total_steps)
-    ratios = jax.vmap(lambda t: mixture.real_ratios(settings, hyper, None, t)[0])(steps)
+    ratios = jax.vmap(lambda t: mixing.real_ratios(settings, hyper, None, t)[0])(steps)
     assert float(ratios.mean()) == pytest.approx(mean, abs=1e-3)
     assert float(ratios[0]) == 1
 
 
 @pytest.mark.parametrize("mean", [0.0, 1.0])
 def test_the_linear_schedule_of_no_or_only_real_data_is_constant(mean):
-    np.testing.assert_allclose(mixture.linear(jnp.float32(mean), jnp.array([0.01, 0.5, 0.99])), mean)
+    np.testing.assert_allclose(mixing.linear(jnp.float32(mean), jnp.array([0.01, 0.5, 0.99])), mean)
 
 
 ARMS = (0.0, 0.1, 0.3, 0.5)
@@ -93,9 +93,9 @@ def _bandit(gains, counts):
 
 def _credited(*episodes):
     """What is known of four arms after these: arm and return each."""
-    bandit = mixture.init(tiny(real_ratio_schedule="bandit", real_ratio_arms=list(ARMS)))
+    bandit = mixing.init(tiny(real_ratio_schedule="bandit", real_ratio_arms=list(ARMS)))
     for arm, episode_return in episodes:
-        bandit = mixture.credit(bandit, arm, jnp.float32(episode_return))
+        bandit = mixing.credit(bandit, arm, jnp.float32(episode_return))
     return bandit
 
 
@@ -104,7 +104,7 @@ def test_members_learn_with_arms_in_the_shares_of_their_probabilities():
     settings = tiny(n_models=2, n_policies=5, real_ratio_schedule="bandit", real_ratio_arms=[0.1, 0.5])
 
     def ratios(c):
-        return mixture.real_ratios(settings, Hyper.of(settings), _bandit([0.0, c - 1], [0.0, c - 1]), 0).reshape(2, 5)
+        return mixing.real_ratios(settings, Hyper.of(settings), _bandit([0.0, c - 1], [0.0, c - 1]), 0).reshape(2, 5)
 
     low, high = 0.1, 0.5
     np.testing.assert_allclose(ratios(1.01)[0], [low, low, low, high, high])  # half of ten: m first, then n
@@ -116,22 +116,22 @@ def test_members_learn_with_arms_in_the_shares_of_their_probabilities():
 
 def test_at_first_all_arms_have_members():
     settings = tiny(n_models=1, n_policies=4, real_ratio_schedule="bandit", real_ratio_arms=list(ARMS))
-    bandit = mixture.init(settings)
-    np.testing.assert_allclose(mixture.real_ratios(settings, Hyper.of(settings), bandit, 0), ARMS)
+    bandit = mixing.init(settings)
+    np.testing.assert_allclose(mixing.real_ratios(settings, Hyper.of(settings), bandit, 0), ARMS)
     constant = tiny(n_models=1, n_policies=2, real_ratio=0.4)
-    np.testing.assert_allclose(mixture.real_ratios(constant, Hyper.of(constant), None, 0), [0.4, 0.4])
+    np.testing.assert_allclose(mixing.real_ratios(constant, Hyper.of(constant), None, 0), [0.4, 0.4])
 
 
 def test_nothing_known_is_an_equal_chance():
-    np.testing.assert_allclose(mixture.probabilities(_credited()), 0.25, rtol=1e-5)
+    np.testing.assert_allclose(mixing.probabilities(_credited()), 0.25, rtol=1e-5)
 
 
 def test_an_episode_is_credited_to_its_arm_and_older_ones_are_forgotten():
-    wins, losses = mixture.beliefs(_credited((1, 60.0), (2, 20.0)))
+    wins, losses = mixing.beliefs(_credited((1, 60.0), (2, 20.0)))
     second = 1 - 1 / (8 * math.sqrt(2))
     np.testing.assert_allclose(wins, [1, 1 + second, 1, 1], rtol=1e-6)  # 60 is the top of the range, 20 its bottom
     np.testing.assert_allclose(losses, [1, 1, 2, 1], rtol=1e-6)
-    wins, losses = mixture.beliefs(_credited((1, 60.0), (2, 20.0), (3, 30.0)))
+    wins, losses = mixing.beliefs(_credited((1, 60.0), (2, 20.0), (3, 30.0)))
     third = 1 - 1 / (8 * math.sqrt(3))
     lowest, span = 40 - 20 * third, 40 * third  # of 20 to 60, shrunk around its middle
     gain = (30 - lowest) / span
@@ -142,9 +142,7 @@ def test_an_episode_is_credited_to_its_arm_and_older_ones_are_forgotten():
 def test_an_outlier_is_forgotten():
     """Arm 0 earns 900, arm 1 600; once something went wrong."""
     episodes = [(i % 2, 900.0 - 300.0 * (i % 2)) for i in range(100)]
-    clean, spoilt = (
-        mixture.probabilities(_credited(*episodes[:10], *odd, *episodes[10:])) for odd in ([], [(2, -9e3)])
-    )
+    clean, spoilt = (mixing.probabilities(_credited(*episodes[:10], *odd, *episodes[10:])) for odd in ([], [(2, -9e3)]))
     assert clean[0] - clean[1] > 0.5
     assert spoilt[0] - spoilt[1] > 0.4
 
@@ -152,15 +150,15 @@ def test_an_outlier_is_forgotten():
 @pytest.mark.parametrize("value", [0.0, 0.1, -2500.0, 1e6])
 def test_before_the_first_success_arms_take_turns(value):
     """All returns are equal: rounding must not tell arms apart that have nothing between them."""
-    once = mixture.probabilities(_credited((0, value), (1, value), (1, value)))
+    once = mixing.probabilities(_credited((0, value), (1, value), (1, value)))
     assert once[1] < once[0] < once[2] == pytest.approx(float(once[3]))
-    often = mixture.probabilities(_credited(*((i % 4, value) for i in range(80))))
+    often = mixing.probabilities(_credited(*((i % 4, value) for i in range(80))))
     np.testing.assert_allclose(often, 0.25, atol=0.05)
 
 
 def test_the_probability_to_be_the_best_in_closed_form():
     """Of X ~ Beta(a, 1) and Y ~ Beta(c, 1), X is the larger with probability a / (a + c)."""
-    probs = mixture.probabilities(_bandit([4.0, 1.5], [4.0, 1.5]))
+    probs = mixing.probabilities(_bandit([4.0, 1.5], [4.0, 1.5]))
     np.testing.assert_allclose(probs, [5 / 7.5, 2.5 / 7.5], atol=1e-4)
 
 
@@ -179,7 +177,7 @@ def test_the_probability_to_be_the_best_by_quadrature(gains, counts):
     points = [law.mean() for law in laws]
     exact = [scipy.integrate.quad(density, 0, 1, args=(arm,), points=points, limit=500)[0] for arm in range(3)]
     np.testing.assert_allclose(sum(exact), 1, atol=1e-6)
-    np.testing.assert_allclose(mixture.probabilities(_bandit(gains, counts)), exact, atol=2e-4)
+    np.testing.assert_allclose(mixing.probabilities(_bandit(gains, counts)), exact, atol=2e-4)
 
 
 def test_the_bandit_follows_the_best_arm_when_it_changes():
@@ -187,9 +185,9 @@ def test_the_bandit_follows_the_best_arm_when_it_changes():
 
     def round_(bandit: Bandit, xs):
         best, key = xs
-        arm = jax.random.categorical(key, jnp.log(mixture.probabilities(bandit)))
+        arm = jax.random.categorical(key, jnp.log(mixing.probabilities(bandit)))
         gain = jnp.where(arm == best, 0.9, 0.1)
-        return mixture.credit(bandit, arm, gain), gain
+        return mixing.credit(bandit, arm, gain), gain
 
     best = jnp.where(jnp.arange(400) < 200, 0, 3)
     _, gains = jax.lax.scan(
@@ -210,7 +208,7 @@ def run(kind="scan", **changes):
     for epoch in range(settings.total_steps // settings.epoch_steps):
         state, news = driver.run(state, settings.epoch_steps // settings.stride)
         lines += metrics.episode_lines(news, epoch * settings.epoch_steps, settings)
-        epochs += metrics.epoch_lines(state, settings)
+        epochs += metrics.epoch_lines(state, driver.algorithm)
     return settings, driver, state, lines, epochs
 
 

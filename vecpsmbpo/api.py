@@ -45,7 +45,7 @@ class DynamicsModel:
     """One of the N models of a lane: model(obs [..., O], action [..., A]) -> Prediction. Actions lie in [-1, 1]."""
 
     def __init__(self, model: Model, algorithm: Algorithm):
-        net, spec = dynamics.network(algorithm.settings, algorithm.spec), algorithm.spec
+        net, spec = algorithm.model_net, algorithm.spec
 
         def predict(obs: jax.Array, action: jax.Array) -> Prediction:
             mean, log_variance, logit = dynamics.forward(model, obs, action, net=net)

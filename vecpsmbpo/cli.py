@@ -254,11 +254,17 @@ def _help(command: str = "") -> str:
     from importlib import resources
 
     from vecpsmbpo import arguments, config
-    from vecpsmbpo.algorithms.catalogue import FIELDS
+    from vecpsmbpo.algorithms.catalogue import FIELDS, allowed
 
     if command in MODULES:
         module = importlib.import_module(MODULES[command])
         return arguments.explain(command, module.__doc__ or "", module.OPTIONS)
+    if command == "eval":
+        words = {
+            name: arguments.Option(word.what, None, str, allowed(word.setting))
+            for name, word in config.EVALUATION.items()
+        }
+        return arguments.explain(command, config.evaluation.__doc__ or "", words)
     plain = [name for name in FIELDS if name not in config.GROUPS]
     return HELP.format(
         groups="\n".join(

@@ -17,7 +17,7 @@ VALIDATION_BATCH = 512
 
 
 class Split(NamedTuple):
-    """A random split of the first `rows` rows of D_E into training and validation.
+    """A random split of the first `added` rows of D_E into training and validation.
 
     Of every k consecutive rows, row `offset` of that block validates and the other k - 1 train. This is exactly
     1/k of the data, drawn anew at every refit, and needs no permutation of a data set whose size is traced; the
@@ -32,9 +32,9 @@ class Split(NamedTuple):
     blocks: jax.Array
 
     @classmethod
-    def draw(cls, key: PRNGKeyArray, rows: Whole, capacity: int, block: int) -> "Split":
+    def draw(cls, key: PRNGKeyArray, added: Whole, capacity: int, block: int) -> "Split":
         offset = jax.random.randint(key, (-(-capacity // block),), 0, block)
-        return cls(offset, jnp.minimum(rows, capacity) // block)
+        return cls(offset, jnp.minimum(added, capacity) // block)
 
     def train_rows(self, key: PRNGKeyArray, batch: int, block: int) -> Int[Array, " {batch}"]:
         """Indices of training rows, uniform with replacement."""
@@ -74,13 +74,13 @@ def init(key: PRNGKeyArray, hyper: Hyper, settings: Settings, spec: EnvSpec) -> 
     return Model(params, optim.init(params), plain, loss=zero, val_mse=zero, prior=prior)
 
 
-def scaling(moments: Moments, rows: Whole, settings: Settings) -> Scaling:
+def scaling(moments: Moments, added: Whole, settings: Settings) -> Scaling:
     """What whitens the inputs (equation 20) and, with `whiten_targets`, the outputs: changes Δs and rewards.
 
     What has never varied is left unscaled: there is nothing to learn of it yet, and dividing by a vanishing deviation
     would turn its first change into an explosion.
     """
-    std = jnp.sqrt(moments.deviation / jnp.maximum(rows, 1))
+    std = jnp.sqrt(moments.deviation / jnp.maximum(added, 1))
     std = jnp.where(std > 1e-6, std, 1.0)
     size = moments.inputs
     outputs = std[size:] if settings.whiten_targets else jnp.ones_like(std[size:])
@@ -101,7 +101,7 @@ def forward(
 
 
 class Successor(NamedTuple):
-    """A draw from the model: next_obs [..., O], reward [...], terminated [...] bool."""
+    """What follows in the model: next_obs [..., O], reward [...], terminated [...] bool."""
 
     next_obs: jax.Array
     reward: jax.Array
@@ -116,39 +116,20 @@ def predict(
     *,
     net: networks.GaussianMLP,
     spec: EnvSpec,
+    sampled: bool = True,
 ) -> Successor:
-    """A draw of (s', r) ~ N((s + Δs, r), σ²) (equation 21), and whether it ends the episode: by the task's own rule,
-    or drawn with the learned probability where that is not known.
+    """A draw of (s', r) ~ N((s + Δs, r), σ²) (equation 21), or the mean of that where it is not `sampled`; and whether
+    it ends the episode: by the task's own rule, or drawn with the learned probability where that is not known.
     """
     prediction = forward(model, obs, action, net=net)
-    noise = jax.random.normal(key, prediction.mean.shape)
-    sample = prediction.mean + jnp.exp(0.5 * prediction.log_variance) * noise
-    return _successor(prediction, sample, obs, action, key, spec)
-
-
-def predict_mean(
-    model: Model,
-    obs: Float[Array, "*batch O"],
-    action: Float[Array, "*batch A"],
-    key: PRNGKeyArray,
-    *,
-    net: networks.GaussianMLP,
-    spec: EnvSpec,
-) -> Successor:
-    """As `predict`, with the mean of (s', r); a learned end of the episode is drawn all the same."""
-    prediction = forward(model, obs, action, net=net)
-    return _successor(prediction, prediction.mean, obs, action, key, spec)
-
-
-def _successor(
-    prediction: networks.Prediction, change: jax.Array, obs: jax.Array, action: jax.Array, key: jax.Array, spec: EnvSpec
-) -> Successor:
-    """change: (Δs, r) [..., O + 1]."""
-    next_obs, reward = obs + change[..., :-1], change[..., -1]
-    if spec.terminated is None:
-        probability = jax.nn.sigmoid(prediction.logit)
-        return Successor(next_obs, reward, jax.random.bernoulli(jax.random.fold_in(key, 1), probability))
-    return Successor(next_obs, reward, spec.terminated(obs, action, next_obs))
+    outputs = prediction.mean
+    if sampled:
+        outputs += jnp.exp(0.5 * prediction.log_variance) * jax.random.normal(key, outputs.shape)
+    next_obs, reward = obs + outputs[..., :-1], outputs[..., -1]
+    if spec.terminated is not None:
+        return Successor(next_obs, reward, spec.terminated(obs, action, next_obs))
+    terminates = jax.random.bernoulli(jax.random.fold_in(key, 1), jax.nn.sigmoid(prediction.logit))
+    return Successor(next_obs, reward, terminates)
 
 
 def negative_log_likelihood(
@@ -238,8 +219,8 @@ def fit(
         batch = rows_of(split.train_rows(key, settings.model_batch_size, block))
         objective = lambda params: loss(model.replace(params=params), batch, net=net)  # noqa: E731
         value, gradient = jax.value_and_grad(objective)(params)
-        gradient = jax.tree.map(partial(optim.with_decay, hyper.model_weight_decay), gradient, params)
-        return *optim.step(gradient, optimizer, params, hyper.model_learning_rate), value
+        rate, decay = hyper.model_learning_rate, hyper.model_weight_decay
+        return *optim.step(gradient, optimizer, params, rate, decay=decay), value
 
     def validate(params: Params) -> jax.Array:
         return validation_error(model.replace(params=params), rows_of, split, block, net=net)

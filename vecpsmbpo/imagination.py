@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from vecpsmbpo import dynamics, replay, sac
+from vecpsmbpo import dynamics, networks, replay, sac
 from vecpsmbpo.settings.parts import ImaginationSettings
 from vecpsmbpo.types import EnvSpec, Model, Params, Transition, Whole
 
@@ -87,6 +87,8 @@ def step(
     obs: Float[Array, "B O"],
     key: PRNGKeyArray,
     *,
+    net: networks.GaussianMLP,
+    nets: sac.Networks,
     settings: ImaginationSettings,
     spec: EnvSpec,
 ) -> Transition:
@@ -99,8 +101,7 @@ def step(
         Transition with leaves [B, ...]; the policy's sampled action, the model's sampled successor, reward and end.
     """
     action_key, model_key = jax.random.split(key)
-    action, _ = sac.make_networks(settings, spec).actor.distribution(actor, obs).sample(action_key)
-    net = dynamics.network(settings, spec)
+    action, _ = nets.actor.distribution(actor, obs).sample(action_key)
     predict = partial(dynamics.predict, net=net, spec=spec)
     if settings.rollout_models == "any":
         predict = partial(predict_with_any, predict)
@@ -135,7 +136,7 @@ def predict_with_any(
 
 
 def start_states(
-    real: Float[Array, "C F"], rows: Whole, key: PRNGKeyArray, count: int, spec: EnvSpec
+    real: Float[Array, "C F"], added: Whole, key: PRNGKeyArray, count: int, spec: EnvSpec
 ) -> Float[Array, "{count} O"]:
     """Observations drawn uniformly from D_E."""
-    return real[replay.sample_indices(key, (count,), rows, real.shape[0]), : spec.obs_size]
+    return real[replay.sample_indices(key, (count,), added, real.shape[0]), : spec.obs_size]

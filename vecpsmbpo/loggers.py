@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from vecpsmbpo import whole
+from vecpsmbpo import atomic
 from vecpsmbpo.settings import SettingError, Settings
 
 PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
@@ -88,7 +88,7 @@ class Loggers:
         return Remote(
             lambda: kinds[name](settings, self._run_dir, env_steps),
             lambda error: self._drop(name, error),
-            lambda env_steps: whole.write_text(path, str(env_steps)),
+            lambda env_steps: atomic.write_text(path, str(env_steps)),
         )
 
     def scalars(self, values: Values, env_steps: int) -> None:
@@ -287,7 +287,7 @@ def _id(run_dir: Path, name: str, make: Callable[[], str]) -> str:
     """What the run is called at a logger's server: the same in every session."""
     path = run_dir / IDS.format(name)
     if not path.exists() or not path.stat().st_size:
-        whole.write_text(path, make())
+        atomic.write_text(path, make())
     return path.read_text(errors="replace").strip()
 
 

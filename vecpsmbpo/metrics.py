@@ -4,7 +4,6 @@ And sessions.jsonl: a line for each time that somebody began, or went on with, t
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -12,15 +11,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from vecpsmbpo import jsonl, mixture
+from vecpsmbpo import jsonl, logged
+from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE, Line
 from vecpsmbpo.loggers import Loggers
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.settings.parts import PosteriorSettings
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
 SESSIONS_FILE = "sessions.jsonl"
-LEARNED = ("critic_loss", "actor_loss", "alpha", "q_mean", "entropy")  # in every line, null where nothing learns so
+ALWAYS = tuple(name for name, quantity in logged.QUANTITIES.items() if quantity.always)
 read = jsonl.read
 
 
@@ -130,7 +129,7 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
     return lines
 
 
-def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
+def epoch_lines(state: TrainState, algorithm: Algorithm) -> list[Line]:
     """What the train state says of the epoch that has just ended, one line per seed (and swept value).
 
     Null: there was nothing yet.
@@ -138,12 +137,12 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
     Args:
         state: without padding (`Layout.unpad`); its rings are not looked at.
     """
-    seeds = state.seeds
+    settings, seeds = algorithm.settings, state.seeds
     stats = {name: np.asarray(value) for name, value in vars(seeds.agents.stats).items()}
     updates = stats.pop("updates")
-    env_steps = int(state.counters.env_steps)
     fitted = np.asarray(seeds.models.optimizer.count)[:, 0] > 0
-    ratios = _real_ratios(state, settings)
+    rest = seeds.replace(key=None, models=None, agents=None, real=None, imagined=None)
+    rest = jax.tree.map(np.asarray, rest)  # of which a lane's part is a view
     lines = []
     for seed in range(len(settings.lanes)):
         episodes = float(seeds.epoch_episodes[seed])
@@ -153,38 +152,31 @@ def epoch_lines(state: TrainState, settings: Settings) -> list[Line]:
         }
         agents = {name: value[seed] / np.maximum(updates[seed], 1) for name, value in stats.items()}
         learned = updates[seed, 0] > 0
+        own = algorithm.numbers(state.counters, jax.tree.map(lambda x, seed=seed: x[seed], rest))
         lines.append(
             {
-                "env_steps": env_steps,
+                "env_steps": int(state.counters.env_steps),
                 **_lane(settings, seed),
                 "train_return": float(seeds.epoch_return[seed]) / episodes if episodes else None,
                 "train_episodes": int(episodes),
                 "unsound_steps": int(seeds.epoch_unsound[seed]),
                 **{name: float(np.mean(value)) if fitted[seed] else None for name, value in models.items()},
-                **dict.fromkeys(LEARNED),
+                **dict.fromkeys(ALWAYS),
                 **{name: float(np.mean(value)) if learned else None for name, value in agents.items()},
-                "real_ratio": None if ratios is None else _number(np.asarray(ratios[seed], np.float64).mean()),
-                "temperature": None if ratios is None else _number(seeds.hyper.temperature[seed]),
+                **{name: _plain(value) for name, value in own.items()},
             }
         )
-        if (bandits := getattr(seeds.own, "bandit", None)) is not None:
-            bandit = jax.tree.map(lambda x, seed=seed: x[seed], bandits)
-            lines[-1]["real_ratio_probs"] = mixture.probabilities(bandit).tolist()
     return lines
-
-
-def _real_ratios(state: TrainState, settings: Settings) -> jax.Array | None:
-    """[S, N·M] the λ of each member now, or None where no data are mixed."""
-    if not isinstance(settings, PosteriorSettings):
-        return None
-    of_seed = partial(mixture.real_ratios, settings, env_steps=state.counters.env_steps)
-    bandits = getattr(state.seeds.own, "bandit", None)
-    return jax.vmap(lambda hyper, bandit: of_seed(hyper, bandit))(state.seeds.hyper, bandits)
 
 
 def _lane(settings: Settings, index: int) -> Line:
     """The seed and the swept values of a lane, by name."""
     return {name: _number(value) for name, value in settings.lanes[index].items()}
+
+
+def _plain(value: Any) -> Any:
+    """A number, or a list of them, in JSON's types."""
+    return np.asarray(value).tolist() if np.ndim(value) else _number(value)
 
 
 def _number(value: Any) -> int | float | str:

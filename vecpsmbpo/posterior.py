@@ -13,13 +13,13 @@ def init(members: int) -> Posterior:
     return Posterior(jnp.zeros(members), jnp.zeros(members), jnp.zeros(members, jnp.int32))
 
 
-def credit(posterior: Posterior, member: Whole, episode_return: Number, counts: Flag) -> Posterior:
-    """Adds an episode's return to its member where `counts` (equation 19 sums over all past episodes).
+def credit(posterior: Posterior, member: Whole, episode_return: Number, enabled: Flag) -> Posterior:
+    """Adds an episode's return to its member where `enabled` (equation 19 sums over all past episodes).
 
     Compensated (Kahan) addition: after hundreds of episodes of thousands, plain float32 sums would be off by more
     than the 1e-5 to which the probabilities can be recomputed from the log.
     """
-    credited = (jnp.arange(posterior.returns.shape[0]) == member) & counts
+    credited = (jnp.arange(posterior.returns.shape[0]) == member) & enabled
     gain = jnp.where(credited, episode_return, 0.0) - posterior.compensation
     total = posterior.returns + gain
     compensation = (total - posterior.returns) - gain

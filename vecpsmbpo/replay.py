@@ -59,6 +59,6 @@ def sample_newest_indices(
     return (added - 1 - age) % capacity
 
 
-def count(added: Whole, capacity: int) -> Int[Array, ""]:
+def wrapped(added: Whole, capacity: int) -> Int[Array, ""]:
     """The `added` rows, less whole turns of a full ring: position and fullness stay, and int32 never overflows."""
     return jnp.where(added < capacity, added, capacity + added % capacity)

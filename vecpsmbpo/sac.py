@@ -56,11 +56,11 @@ class Noise(NamedTuple):
         return cls(*jax.random.normal(key, (2, *shape)))
 
 
-class Limits(NamedTuple):
+class RewardRange(NamedTuple):
     """The least and the most reward of a step, [] each, as far as they are known."""
 
-    lowest_reward: jax.Array
-    highest_reward: jax.Array
+    lowest: jax.Array
+    highest: jax.Array
 
 
 def make_networks(settings: SacSettings, spec: EnvSpec) -> Networks:
@@ -118,16 +118,16 @@ def target_value(
 
 
 def target_range(
-    limits: Limits, alpha: Number, hyper: Hyper, action_size: int
+    reward_range: RewardRange, alpha: Number, hyper: Hyper, action_size: int
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The least and the most that Q can be, if rewards stay within `limits`.
+    """The least and the most that Q can be, if rewards stay within `reward_range`.
 
     At every step the entropy bonus of equations 24 and 29 is at most that of uniform actions, α A log 2, and about that
     of the target entropy where that is negative. No reward at all, as after a termination, is always possible.
     """
     steps = 1 / jnp.maximum(1 - hyper.discount, 1e-6)  # 1 + γ + γ² + …
-    most = jnp.maximum(limits.highest_reward, 0.0) + hyper.discount * alpha * action_size * jnp.log(2.0)
-    least = jnp.minimum(limits.lowest_reward, 0.0) + hyper.discount * alpha * jnp.minimum(hyper.target_entropy, 0.0)
+    most = jnp.maximum(reward_range.highest, 0.0) + hyper.discount * alpha * action_size * jnp.log(2.0)
+    least = jnp.minimum(reward_range.lowest, 0.0) + hyper.discount * alpha * jnp.minimum(hyper.target_entropy, 0.0)
     return least * steps, most * steps
 
 
@@ -174,7 +174,7 @@ def update(
     hyper: Hyper,
     *,
     nets: Networks,
-    limits: Limits | None = None,
+    reward_range: RewardRange | None = None,
     target_every: int = 1,
     mean: Callable[[Any], Any] = lambda parts: parts,
 ) -> Agent:
@@ -183,13 +183,13 @@ def update(
 
     Args:
         batch: leaves [B, ...].
-        limits: of rewards, if the critics' targets are to be kept within what these allow.
+        reward_range: of a step, if the critics' targets are to be kept within what these allow.
         mean: of losses and gradients over the parts of a minibatch that lies on several devices.
     """
     rate = hyper.policy_learning_rate
 
     alpha = jnp.exp(agent.log_alpha)
-    bounds = None if limits is None else target_range(limits, alpha, hyper, batch.action.shape[-1])
+    bounds = None if reward_range is None else target_range(reward_range, alpha, hyper, batch.action.shape[-1])
     critic_value_and_grad = jax.value_and_grad(critic_loss, has_aux=True)
     (loss_q, q_mean), critic_gradient = mean(
         critic_value_and_grad(agent.critic, agent, batch, hyper.discount, noise.next_action, nets=nets, bounds=bounds)

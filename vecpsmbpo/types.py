@@ -6,13 +6,14 @@ members (rounded up to the mesh, see `layout`), B batch, T time, O observation, 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from vecpsmbpo.algorithms.catalogue import TRACED
 from vecpsmbpo.settings import Settings
 
 # Signatures give shapes in these letters, `*batch` for any leading axes: Float[Array, "*batch O"]. Others (H, K, D) are
@@ -60,24 +61,33 @@ class Transition(NamedTuple):
     terminated: jax.Array
 
 
-class Hyper(struct.PyTreeNode):
-    """What may be swept as a number: traced leaves, scalars here and [S] in a train state. None, and no leaf, where the
-    algorithm has no such setting."""
+@jax.tree_util.register_pytree_with_keys_class
+class Hyper:
+    """What may be swept as a number: every setting that is marked `traced`, by its name. Scalars here and [S] in a
+    train state; None, and no leaf, where the algorithm has no such setting."""
 
-    model_learning_rate: jax.Array
-    model_weight_decay: jax.Array
-    prior_scale: jax.Array
-    forced_exploration: jax.Array
-    policy_learning_rate: Any = None
-    discount: Any = None
-    target_entropy: Any = None
-    target_update_rate: Any = None
-    real_ratio: Any = None
-    temperature: Any = None
+    def __init__(self, **values: Any):
+        vars(self).update(values)
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
 
     @classmethod
     def of(cls, settings: Settings) -> "Hyper":
-        return cls(**{name: jnp.float32(getattr(settings, name)) for name in settings.traced})
+        values = {name: getattr(settings, name, None) for name in TRACED}
+        return cls(**{name: None if value is None else jnp.float32(value) for name, value in values.items()})
+
+    def replace(self, **values: Any) -> "Hyper":
+        return Hyper(**{**vars(self), **values})
+
+    def tree_flatten_with_keys(self) -> tuple[Any, Any]:
+        names = tuple(vars(self))
+        return [(jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in names], names
+
+    @classmethod
+    def tree_unflatten(cls, names: Any, leaves: Any) -> "Hyper":
+        return cls(**dict(zip(names, leaves, strict=True)))
 
 
 class Prior(struct.PyTreeNode):
@@ -153,7 +163,7 @@ class Posterior(struct.PyTreeNode):
 
 
 class Bandit(struct.PyTreeNode):
-    """What is known of the K values of λ to choose from (`mixture`).
+    """What is known of the K values of λ to choose from (`mixing`).
 
     Attributes:
         excess, counts: [K], sum of returns above `lowest`, and number, of each arm's episodes, older ones discounted.

@@ -11,7 +11,6 @@ import numpy as np
 from tools.benches.program import driver_of
 from tools.benches.simulators import mjx_steps
 from tools.benches.timing import best_seconds
-from vecpsmbpo.algorithms.ps_mbpo.algorithm import PsMbpo
 from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.layout import SEEDS
 from vecpsmbpo.schedule import over_seeds
@@ -28,9 +27,9 @@ def bench_profile() -> dict[str, Any]:
     A stride by itself pays for being started and for its news, which a run pays once for an epoch: it counts as acting.
     """
     driver = driver_of([] if sys.argv[2:] else ["env=cartpole_swingup", "size=cpu"])
-    settings, algorithm, layout = driver.settings, driver.algorithm, driver.layout
+    settings, layout = driver.settings, driver.layout
     strides, warm = settings.epoch_steps // settings.stride, settings.first_learning_step // settings.stride
-    if not isinstance(algorithm, PsMbpo) or settings.model_update_every == settings.stride or warm < WORLD_STRIDES + 1:
+    if not settings.learns_by_sac or settings.model_update_every == settings.stride or warm < WORLD_STRIDES + 1:
         sys.exit("profile: needs SAC, periods of more than a stride, and a warm-up of more than 100 steps")
     keys, given = initial_inputs(settings)
     state = driver.init(keys, given)

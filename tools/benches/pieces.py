@@ -30,12 +30,13 @@ def pieces_of_update(settings: Settings) -> dict[str, int]:
         rows = jnp.zeros((*shape, replay.row_size(spec.obs_size, spec.action_size)))
         batches = replay.unpack(rows, spec.obs_size, spec.action_size)
         noise = sac.Noise.draw(key, (*shape, spec.action_size))
-        return sac.init(key, nets, spec), batches, noise, Hyper.of(settings), sac.Limits(jnp.zeros(()), jnp.zeros(()))
+        nothing = sac.RewardRange(jnp.zeros(()), jnp.zeros(()))
+        return sac.init(key, nets, spec), batches, noise, Hyper.of(settings), nothing
 
-    def run(agent: Any, batches: Any, noise: Any, hyper: Hyper, limits: sac.Limits) -> Any:
-        known = limits if settings.clip_targets else None
+    def run(agent: Any, batches: Any, noise: Any, hyper: Hyper, reward_range: sac.RewardRange) -> Any:
+        known = reward_range if settings.clip_targets else None
         every = settings.target_update_every
-        return sac.updates(agent, batches, noise, hyper, nets=nets, limits=known, target_every=every)
+        return sac.updates(agent, batches, noise, hyper, nets=nets, reward_range=known, target_every=every)
 
     return loop_pieces(jax.jit(run).lower(*jax.eval_shape(inputs)).compile().as_text())
 

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vecpsmbpo.algorithms.pets.settings import PetsSettings
-from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
+from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings, RealDataSettings
 from vecpsmbpo.algorithms.slbo.settings import SlboSettings
 from vecpsmbpo.settings import Settings
 
@@ -20,25 +20,28 @@ class Entry(NamedTuple):
     """An algorithm.
 
     Attributes:
+        title: its name in the literature.
         settings: the class of its settings.
         place: `module:class` of what learns.
         format: of its checkpoints; a state that gains or loses fields has another one.
     """
 
+    title: str
     settings: type[Settings]
     place: str
     format: int
 
 
-_PS_MBPO = Entry(PsMbpoSettings, "vecpsmbpo.algorithms.ps_mbpo.algorithm:PsMbpo", format=3)
+_PS_MBPO = Entry("PS-MBPO", PsMbpoSettings, "vecpsmbpo.algorithms.ps_mbpo.algorithm:PsMbpo", format=3)
 
+# In the order of legends and tables, which is the paper's.
 TABLE = {
-    "ops_mbpo": _PS_MBPO,
+    "ops_mbpo": _PS_MBPO._replace(title="OPS-MBPO"),
     "ps_mbpo": _PS_MBPO,
-    "mbpo": _PS_MBPO,
-    "sac": _PS_MBPO,
-    "pets": Entry(PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=4),
-    "slbo": Entry(SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo", format=4),
+    "mbpo": _PS_MBPO._replace(title="MBPO"),
+    "slbo": Entry("SLBO", SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo", format=4),
+    "pets": Entry("PETS", PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=4),
+    "sac": _PS_MBPO._replace(title="SAC", settings=RealDataSettings),
 }
 
 

@@ -6,7 +6,7 @@ Everything here runs inside `layout.Layout.jit_shard_map`: models and agents are
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -15,8 +15,20 @@ import numpy as np
 
 from vecpsmbpo import dynamics, health, posterior, replay
 from vecpsmbpo.layout import Layout
+from vecpsmbpo.networks import GaussianMLP
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import Counters, EnvSpec, Episode, EpisodeEnd, Hyper, Moments, Posterior, SeedState, Transition
+from vecpsmbpo.types import (
+    Counters,
+    EnvSpec,
+    Episode,
+    EpisodeEnd,
+    Hyper,
+    Moments,
+    Posterior,
+    SeedState,
+    Transition,
+    Whole,
+)
 
 
 @dataclass(frozen=True)
@@ -26,6 +38,11 @@ class Algorithm(ABC):
     settings: Settings
     spec: EnvSpec
     layout: Layout
+
+    @cached_property
+    def model_net(self) -> GaussianMLP:
+        """The network of every dynamics model."""
+        return dynamics.network(self.settings, self.spec)
 
     # ── what an algorithm adds ───────────────────────────────────────────────────────────────────────────────
 
@@ -67,6 +84,16 @@ class Algorithm(ABC):
         """What is remembered when an episode begins."""
         return ()
 
+    @property
+    def nets(self) -> Any:
+        """The networks of a member, or None where it has none."""
+        return None
+
+    def numbers(self, counters: Counters, state: SeedState) -> dict[str, Any]:
+        """What it has to say in an epoch's line of metrics.jsonl besides the members' `stats`: numbers, and lists of
+        them, by name. Called on the host, with NumPy arrays, and without key, models, agents and rings."""
+        return {}
+
     def values(self, state: SeedState) -> jax.Array | None:
         """[N·M] what each member promises, where `weights=values`, or None."""
         return None
@@ -75,9 +102,9 @@ class Algorithm(ABC):
         """Who acts in the episode that begins, [] int, and the distribution [N·M] that it was drawn from."""
         return jnp.int32(0), jnp.ones(self.settings.n_members)
 
-    def credit(self, state: SeedState, episode_return: jax.Array, counts: jax.Array) -> SeedState:
-        """What the episode that ends earned, [], where `counts`: added to what is known of the member that acted."""
-        credited = posterior.credit(state.posterior, state.episode.member, episode_return, counts)
+    def credit(self, state: SeedState, episode_return: jax.Array, enabled: jax.Array) -> SeedState:
+        """What the episode that ends earned, [], where `enabled`: added to what is known of the member that acted."""
+        credited = posterior.credit(state.posterior, state.episode.member, episode_return, enabled)
         return state.replace(posterior=credited)
 
     def refreshes(self, counters: Counters, state: SeedState) -> jax.Array:
@@ -91,6 +118,10 @@ class Algorithm(ABC):
     @property
     def ring_capacity(self) -> int:
         """C_M: rows that are imagined for a member and kept; 0 where none are."""
+        return 0
+
+    def retained_rows(self, env_steps: Whole) -> Whole:
+        """How many of the newest rows that were imagined for a member it learns from after `env_steps` steps."""
         return 0
 
     def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Any:
@@ -234,9 +265,9 @@ class Algorithm(ABC):
         """Refits every model on D_E (Algorithm 1, line 2) where `enabled`."""
         settings, spec = self.settings, self.spec
         split_key, fit_key = jax.random.split(key)
-        rows = counters.env_steps
-        split = dynamics.Split.draw(split_key, rows, settings.replay_capacity, settings.validation_block)
-        whitening = dynamics.scaling(state.moments, rows, settings)
+        added = counters.env_steps
+        split = dynamics.Split.draw(split_key, added, settings.replay_capacity, settings.validation_block)
+        whitening = dynamics.scaling(state.moments, added, settings)
 
         def fit(model, key, real, split, whitening, hyper):
             return dynamics.fit(model, real, split, whitening, hyper, key, settings=settings, spec=spec)
@@ -255,12 +286,12 @@ def _no_moments(inputs: int, obs_size: int) -> Moments:
     return Moments(zeros, zeros, lowest_reward=zero, highest_reward=zero, inputs=inputs)
 
 
-def _welford(moments: Moments, transition: Transition, rows: jax.Array) -> Moments:
-    """Moments of one more row after `rows` of them."""
+def _welford(moments: Moments, transition: Transition, added: jax.Array) -> Moments:
+    """Moments of one more row after `added` of them."""
     obs, action, reward, next_obs, _ = transition
     value = jnp.concatenate([obs, action, next_obs - obs, reward[None]])
     change = value - moments.mean
-    mean = moments.mean + change / (rows + 1)
+    mean = moments.mean + change / (added + 1)
     return moments.replace(
         mean=mean,
         deviation=moments.deviation + change * (value - mean),

@@ -18,6 +18,9 @@ def of_algorithm(algo: str) -> dict[str, Any]:
 
 # Algorithms that have a setting of the same name mean the same by it.
 FIELDS = {name: field for algo in TABLE for name, field in of_algorithm(algo).items()}
+# Numbers inside the compiled program (`types.Hyper`). Checkpoints know their names and order: with others, those that
+# there are cannot be read.
+TRACED = tuple(name for name, field in FIELDS.items() if fields.is_traced(field))
 
 
 def having(name: str) -> list[str]:
@@ -53,9 +56,8 @@ def check_sweep(name: str, values: Any) -> tuple[float, ...]:
     Raises:
         SettingError: the setting cannot be swept inside one program, or a value is wrong.
     """
-    if name not in FIELDS or not fields.is_traced(FIELDS[name]):
-        traced = ", ".join(name for name, field in FIELDS.items() if fields.is_traced(field))
-        raise SettingError(f"sweep.{name}: cannot be swept in one program (-m can); one of {traced}")
+    if name not in TRACED:
+        raise SettingError(f"sweep.{name}: cannot be swept in one program (-m can); one of {', '.join(TRACED)}")
     if not isinstance(values, list | tuple) or not values:
         raise SettingError(f"sweep.{name}={values}: must be a list of values, each {allowed(name)}")
     checked = tuple(check(name, value) for value in values)

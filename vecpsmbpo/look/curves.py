@@ -14,25 +14,6 @@ from vecpsmbpo.settings import SettingError
 Array = np.ndarray
 
 POINTS = 200  # of a curve over seconds, where no two seeds share any
-AXES = {
-    "env_steps": "environment steps",
-    "seconds": "seconds",
-    "eval_return": "evaluation return",
-    "train_return": "return in training",
-    "eval_length": "length of evaluation episodes",
-    "real_ratio": "λ, the share of real data",
-    "real_ratio_probs": "probability of each λ",
-    "alpha": "SAC's entropy coefficient α",
-    "entropy": "policy entropy",
-    "q_mean": "mean Q",
-    "critic_loss": "critic loss",
-    "actor_loss": "actor loss",
-    "model_loss": "model loss (negative log-likelihood)",
-    "model_val_mse": "model validation error",
-    "env_steps_per_s": "environment steps per second",
-    "updates_per_s": "updates per second",
-    "imagined_per_s": "imagined steps per second",
-}
 AVERAGES: dict[str, Callable[..., Array]] = {"mean": np.mean, "iqm": statistics.trimmed_mean}
 
 

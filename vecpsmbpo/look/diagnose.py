@@ -158,13 +158,12 @@ class _Probe:
         }
 
     def _models(self, trained: "Trained", seen: Any, random: np.random.Generator, key: Any) -> dict[str, Any] | None:
-        from vecpsmbpo import dynamics
         from vecpsmbpo.look import diagnostics
 
         models, spec = trained.models(), trained.algorithm.spec
         if models is None:
             return None
-        net = dynamics.network(trained.run.settings, spec)
+        net = trained.algorithm.model_net
         windows = diagnostics.windows(seen, self._horizon, self._length, random)
         windows = windows.until(int(windows.there.any(axis=0).sum()))
         mean, variance = diagnostics.imagine(models, windows.obs, windows.action, key, net=net, spec=spec)
@@ -172,8 +171,8 @@ class _Probe:
         steps = np.argwhere(seen.there[:, : self._length])
         rows = tuple(steps[random.permutation(len(steps))[: diagnostics.ROWS]].T)
         truth = np.concatenate([seen.next_obs[rows], seen.reward[rows][:, None]], axis=-1)
-        surprises = diagnostics.surprise(models, seen.obs[rows], seen.action[rows], truth, net=net)
-        calibration = diagnostics.calibration(np.asarray(surprises))
+        residuals = diagnostics.residuals(models, seen.obs[rows], seen.action[rows], truth, net=net)
+        calibration = diagnostics.calibration(np.asarray(residuals))
         spread = truth.std(axis=0)
         return {
             "dimensions": [*(f"obs {index}" for index in range(spec.obs_size)), "reward"],
@@ -197,7 +196,7 @@ class _Probe:
         q = np.asarray(diagnostics.values(critics, obs, action, nets=nets)).reshape(seen.reward.shape)
         earned = diagnostics.returns(seen, self._discount, np.repeat(alpha, self._each))
         plain = diagnostics.returns(seen, self._discount, np.zeros(len(q)))
-        known = diagnostics.told(seen, self._discount)
+        known = diagnostics.known(seen, self._discount)
         known[:, self._length :] = False
         if not known.any():
             return None

@@ -138,7 +138,7 @@ def _mean(values: Array, there: Array) -> Array:
 
 
 @partial(jax.jit, static_argnames="net")
-def surprise(
+def residuals(
     models: Model, obs: jax.Array, action: jax.Array, truth: jax.Array, *, net: networks.GaussianMLP
 ) -> jax.Array:
     """(y - μ) / σ of what each model said of the next observations and rewards truth [B, D]: [N, B, D].
@@ -165,11 +165,11 @@ class Calibration(NamedTuple):
     histogram: Array
 
 
-def calibration(surprises: Array) -> Calibration:
-    """Of surprises [N, B, D]."""
+def calibration(residuals: Array) -> Calibration:
+    """Of residuals [N, B, D]."""
     bounds = norm.ppf(0.5 + np.array(LEVELS) / 2)
-    coverage = (np.abs(surprises)[:, None] <= bounds[:, None, None]).mean(axis=2)
-    places: Any = norm.cdf(surprises).reshape(len(surprises), -1)
+    coverage = (np.abs(residuals)[:, None] <= bounds[:, None, None]).mean(axis=2)
+    places: Any = norm.cdf(residuals).reshape(len(residuals), -1)
     counts = [np.histogram(one, bins=BINS, range=(0, 1))[0] for one in places]
     return Calibration(coverage, np.stack(counts) * BINS / places.shape[1])
 
@@ -198,7 +198,7 @@ def returns(episodes: Episodes, discount: float, alpha: Array) -> Array:
     return found
 
 
-def told(episodes: Episodes, discount: float) -> Array:
+def known(episodes: Episodes, discount: float) -> Array:
     """[E, T] bool: where enough of what followed was seen to know the return, all of it or all but `TAIL`."""
     left = episodes.there[:, ::-1].cumsum(axis=1)[:, ::-1]
     whole = episodes.terminated.any(axis=1, keepdims=True)

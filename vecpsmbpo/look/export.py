@@ -23,7 +23,6 @@ from vecpsmbpo import arguments, jsonl, recorded
 from vecpsmbpo.look import dataset, files, runs
 from vecpsmbpo.look.exported import ABOUT_FILE, WEIGHTS_FILE
 from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.settings.parts import SacSettings
 
 if TYPE_CHECKING:
     from vecpsmbpo.look.members import Trained
@@ -79,7 +78,7 @@ def run(words: Sequence[str]) -> int:
         _check_extra(name)
     found = runs.load(path)
     runs.check_lane(found, options["lane"])
-    if not isinstance(found.settings, SacSettings):
+    if not found.settings.learns_by_sac:
         raise SettingError(
             f"run_dir={path}: only policies that learn by SAC can be exported, not algo={found.settings.algo}"
         )

@@ -10,14 +10,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from vecpsmbpo import arguments, config
+from vecpsmbpo import arguments, config, logged
 from vecpsmbpo.look import compare, experiments, files, groups, published, states
-from vecpsmbpo.look.curves import AXES, Curve, curve, error_band, joined
+from vecpsmbpo.look.curves import Curve, curve, error_band, joined
 from vecpsmbpo.look.experiments import Experiment
 from vecpsmbpo.look.groups import Group
 from vecpsmbpo.look.runs import Lane
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.settings.parts import PosteriorSettings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -105,8 +104,8 @@ def _panels(
     figure.suptitle(_note(experiment), x=0.01, ha="left", fontsize=9)
     for axis, (task, _) in zip(axes, tasks, strict=False):
         axis.set_title(task)
-        axis.set_ylabel(AXES["eval_return"])
-        style.steps_axis(axis, AXES["env_steps"])
+        axis.set_ylabel(logged.of("eval_return").label)
+        style.steps_axis(axis, logged.of("env_steps").label)
     return figure, [(axis, task, here) for axis, (task, here) in zip(axes, tasks, strict=False)], axes[len(tasks) :]
 
 
@@ -234,17 +233,15 @@ def draw_weights(experiment: Experiment) -> "Figure":
     for axis, until, part in ((first, INITIAL * end, "first third"), (whole, end, "whole")):
         posterior.draw_weights(axis, lane, "env_steps", until=until)
         axis.set_title(part, loc="right", fontsize=9)
-        style.steps_axis(axis, AXES["env_steps"])
+        style.steps_axis(axis, logged.of("env_steps").label)
     look, sampled = style.looks(2)
     style.line(returns, look, lane.epochs["env_steps"], lane.epochs["eval_return"], label="evaluation")
     style.line(returns, sampled, lane.epochs["env_steps"], lane.epochs["train_return"], label="in training")
-    style.steps_axis(returns, AXES["env_steps"])
+    style.steps_axis(returns, logged.of("env_steps").label)
     returns.set_ylabel("return")
     returns.legend()
-    settings = lane.run.settings
-    assert isinstance(settings, PosteriorSettings)
     where = f"experiment={experiment.name} size={experiment.size}"
-    title = f"{settings.task}: {where}, {lane.name}, τ = {settings.temperature:g}"
+    title = f"{lane.run.settings.task}: {where}, {lane.name}, τ = {lane.setting('temperature'):g}"
     figure.suptitle(title, x=0.01, ha="left", fontsize=9)
     return figure
 
@@ -262,7 +259,7 @@ def draw_schedules(experiment: Experiment) -> "Figure":
     ratios.set_title(f"λ on {task}")
     ratios.set_ylabel("λ")
     ratios.set_ylim(-0.03, 1.03)
-    style.steps_axis(ratios, AXES["env_steps"])
+    style.steps_axis(ratios, logged.of("env_steps").label)
     style.legend(figure, ratios, columns=3)
     return figure
 

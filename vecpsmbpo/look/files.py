@@ -4,19 +4,19 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from vecpsmbpo import whole
+from vecpsmbpo import atomic
 from vecpsmbpo.settings import SettingError
 
 
 def write(path: Path, make: Callable[[Path], object]) -> None:
-    """As `whole.write`, in a directory that is made for it.
+    """As `atomic.write`, in a directory that is made for it.
 
     Raises:
         SettingError: it cannot be written; what stood at `path` is as it was.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        whole.write(path, make)
+        atomic.write(path, make)
     except OSError as error:
         raise SettingError(f"out={path}: cannot be written ({error.strerror or error})") from None
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vecpsmbpo.algorithms import TABLE
 from vecpsmbpo.algorithms.catalogue import FIELDS
 from vecpsmbpo.config import closest
 from vecpsmbpo.look.runs import Lane, Run
@@ -24,15 +25,6 @@ SYMBOLS = {
     "prior_scale": "β",
     "forced_exploration": "τ_f",
     "discount": "γ",
-}
-# The paper's order, and with it that of colours and legends.
-ALGORITHMS = {
-    "ops_mbpo": "OPS-MBPO",
-    "ps_mbpo": "PS-MBPO",
-    "mbpo": "MBPO",
-    "slbo": "SLBO",
-    "pets": "PETS",
-    "sac": "SAC",
 }
 
 
@@ -59,7 +51,7 @@ class Group:
 def display(name: str, value: Any) -> str:
     """A value as a person writes it."""
     if name == "algo":
-        return ALGORITHMS.get(value, str(value))
+        return TABLE[value].title if value in TABLE else str(value)
     if name == "real_ratio_schedule":
         return {"linear": "λ falling from 1", "bandit": "λ chosen online"}.get(value, f"λ {value}")
     if isinstance(value, bool):
@@ -155,8 +147,8 @@ def _repeats(lanes: Sequence[Lane], facts: Sequence[Mapping[str, Any]], names: S
 
 
 def _rank(group: Group) -> tuple:
-    """Algorithms in the paper's order, numbers by size, the rest by name."""
-    order = list(ALGORITHMS)
+    """Algorithms in the order of their table, numbers by size, the rest by name."""
+    order = list(TABLE)
 
     def key(name: str, value: Any) -> tuple[int, float, str]:
         if name == "algo":

@@ -9,16 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import imagination, networks, posterior, replay, sac
+from vecpsmbpo import networks, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
-from vecpsmbpo.algorithms.pets.settings import PetsSettings
-from vecpsmbpo.algorithms.ps_mbpo.algorithm import PsMbpo
 from vecpsmbpo.checkpoint import Saved
 from vecpsmbpo.drivers.common import evaluation_policies
 from vecpsmbpo.evaluate import restore, restore_each
 from vecpsmbpo.look.runs import Run, check_lane
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.settings.parts import ImaginationSettings, PosteriorSettings, SacSettings
 from vecpsmbpo.types import Model, SeedState
 
 Array = np.ndarray
@@ -49,14 +46,14 @@ class Trained:
 
     @property
     def has_members(self) -> bool:
-        """Whether policies learn by SAC, so that each can be asked by itself."""
-        return isinstance(self.run.settings, SacSettings)
+        """Whether each policy, and its critics, can be asked by itself."""
+        return self.run.settings.learns_by_sac
 
     @property
     def nets(self) -> sac.Networks:
         """Of its policies, where it `has_members`."""
-        assert isinstance(self.algorithm, PsMbpo)
-        return self.algorithm.nets
+        nets: sac.Networks = self.algorithm.nets
+        return nets
 
     def actors(self) -> Any:
         """Parameters of every member's policy, leaves [N·M, ...]."""
@@ -82,11 +79,9 @@ class Trained:
         members; None where nothing is imagined."""
         if not self.imagined_rows:
             return None
-        settings = self.run.settings
-        assert isinstance(settings, ImaginationSettings), "others have no rings"
         assert self.state.imagined is not None
         rings = self.state.imagined[self.index][self._members]
-        newest = min(self.imagined_rows, int(imagination.retained_rows(settings, jnp.int32(self.step))))
+        newest = min(self.imagined_rows, int(self.algorithm.retained_rows(jnp.int32(self.step))))
         rows = (self.imagined_rows - 1 - random.integers(0, newest, most)) % rings.shape[1]
         return self._observations(rings, (random.integers(0, len(rings), most), rows))
 
@@ -148,7 +143,7 @@ def acting(trained: Trained, member: str) -> list[tuple[str, Act]]:
         SettingError: the algorithm plans, has no members, or not this one.
     """
     settings = trained.run.settings
-    if isinstance(settings, PetsSettings):
+    if settings.plans_actions:
         raise SettingError(f"run_dir={trained.run.path}: algo={settings.algo} plans its actions; there is no policy")
     if member in ("best", "posterior"):
         return [(member, _evaluated(trained, member))]
@@ -190,7 +185,7 @@ def _evaluated(trained: Trained, who: str) -> Act:
     anything, the mean of all members' actions."""
     settings = trained.run.settings
     settings = replace(settings, eval_policy=who, eval_actions="mean")
-    if isinstance(settings, PosteriorSettings) and settings.posterior == "average":
+    if settings.averages_members:
         actor, actors = trained.nets.actor, trained.actors()
         return jax.jit(lambda obs: jax.vmap(lambda params: actor.distribution(params, obs).mode())(actors).mean(axis=0))
     algorithm = replace(trained.algorithm, settings=settings)

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vecpsmbpo import arguments
+from vecpsmbpo import arguments, logged
 from vecpsmbpo.look import files, groups, published, runs
-from vecpsmbpo.look.curves import AVERAGES, AXES, Curve, check_columns, curve
+from vecpsmbpo.look.curves import AVERAGES, Curve, check_columns, curve
 from vecpsmbpo.settings import SettingError
 
 OPTIONS = {
@@ -79,8 +79,8 @@ def draw(found: list[runs.Run], options: dict[str, Any]) -> None:
             if len(curves) == 1:  # several groups of seeds would be a thicket
                 style.threads(axis, looks[curves[0].name], curves[0].x, curves[0].seeds)
             draw_curves(axis, curves, looks)
-            axis.set_ylabel(AXES.get(y, y))
-            style.steps_axis(axis, AXES[options["x"]])
+            axis.set_ylabel(logged.of(y).label)
+            style.steps_axis(axis, logged.of(options["x"]).label)
             if y == "eval_return":
                 draw_references(axis, references)
         average = {"mean": "mean", "iqm": "interquartile mean"}[options["average"]]

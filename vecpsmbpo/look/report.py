@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vecpsmbpo import arguments, config
+from vecpsmbpo import arguments, config, logged
 from vecpsmbpo.algorithms.catalogue import of_algorithm
 from vecpsmbpo.jsonl import METRICS_FILE
 from vecpsmbpo.look import compare, diagnose, files, groups, runs, statistics
-from vecpsmbpo.look.curves import AXES, curve
+from vecpsmbpo.look.curves import curve
 from vecpsmbpo.look.runs import Lane, Run
 from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.settings.parts import PosteriorSettings
 
 if TYPE_CHECKING:
     from vecpsmbpo.look.page import Page
@@ -35,20 +34,7 @@ REFRESH_S = 30  # after which a browser looks for a newer one, while the run goe
 WINDOW = 5  # epochs that count as the last ones
 PICTURED = 3  # a row of them: lanes whose posterior is drawn at once; the others are there to be opened
 SHOWN = 60  # rows of the table of epochs
-
-# What is drawn of the inside of a run: the column, what it says, and whether it spans powers of ten.
-INSIDE = (
-    ("real_ratio", "λ: the share of real rows in what policies learn from", False),
-    ("critic_loss", "critic loss", True),
-    ("actor_loss", "actor loss", False),
-    ("alpha", "α: SAC's entropy coefficient", False),
-    ("entropy", "entropy of the policies", False),
-    ("q_mean", "mean Q of what is learned from", False),
-    ("model_loss", "negative log-likelihood of the models (equation 17)", False),
-    ("model_val_mse", "validation error of the models", True),
-    ("env_steps_per_s", "environment steps per second, all seeds together", True),
-    ("updates_per_s", "SAC updates per second, all members together", False),
-)
+STEPS = logged.of("env_steps").label
 
 
 def run(words: Sequence[str]) -> int:
@@ -151,10 +137,11 @@ def _curves_picture(page: "Page", together: Sequence[groups.Group], y: str) -> s
     figure, (axes,) = style.grid(1, 1)
     looks = style.looks_of([line.name for line in curves], ordered=plot.is_ordered(together))
     plot.draw_curves(axes, curves, looks)
-    style.steps_axis(axes, AXES["env_steps"])
-    axes.set_ylabel(AXES[y])
+    label = logged.of(y).label
+    style.steps_axis(axes, STEPS)
+    axes.set_ylabel(label)
     style.legend(figure, axes, columns=2)
-    return page.picture(figure, f"{AXES[y]}: mean over seeds, 95% bootstrap band")
+    return page.picture(figure, f"{label}: mean over seeds, 95% bootstrap band")
 
 
 def keep(run_dir: Path, warn: Callable[[str], None]) -> None:
@@ -180,7 +167,7 @@ def _add_run(page: "Page", run: Run, heading: str, diagnosis: dict[str, Any] | N
     if max(len(one.lanes) for one in groups.group([run])) > 1:
         page.add('<p class="soft">Thick lines are means over seeds, thin ones the seeds.</p>')
     _add_posterior(page, run)
-    pictures = [_lanes_picture(page, run, y, caption, log=log) for y, caption, log in INSIDE]
+    pictures = [_lanes_picture(page, run, y) for y, quantity in logged.QUANTITIES.items() if quantity.caption]
     page.add("<h3>Inside</h3>", html.panels(filter(None, (*pictures, _chances_picture(page, run)))))
     if diagnosis is not None:
         _add_diagnosis(page, diagnosis)
@@ -253,7 +240,7 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minute:02}:{second:02}" if hours else f"{minute}:{second:02}"
 
 
-def _lanes_picture(page: "Page", run: Run, y: str, caption: str = "", *, log: bool = False) -> str:
+def _lanes_picture(page: "Page", run: Run, y: str) -> str:
     """Every seed of every swept value, faint, and their mean; nothing where the column is empty."""
     from vecpsmbpo.look import plot, style
 
@@ -266,15 +253,16 @@ def _lanes_picture(page: "Page", run: Run, y: str, caption: str = "", *, log: bo
     for look, line in zip(looks, curves, strict=True):
         style.threads(axes, look, line.x, line.seeds)
         style.line(axes, look, line.x, line.y, label=line.name)
-    if y == "real_ratio":
+    quantity = logged.of(y)
+    if quantity.scale == "share":
         axes.set_ylim(-0.03, 1.03)
-    elif log and min(line.seeds.min() for line in curves if line.seeds.size) > 0:
+    elif quantity.scale == "log" and min(line.seeds.min() for line in curves if line.seeds.size) > 0:
         axes.set_yscale("log")
-    style.steps_axis(axes, AXES["env_steps"])
-    axes.set_ylabel(AXES.get(y, y))
+    style.steps_axis(axes, STEPS)
+    axes.set_ylabel(quantity.label)
     if len(curves) > 1:
         style.legend(figure, axes, columns=3)
-    return page.picture(figure, caption or AXES.get(y, y))
+    return page.picture(figure, quantity.caption or quantity.label)
 
 
 def _chances_picture(page: "Page", run: Run) -> str:
@@ -282,15 +270,15 @@ def _chances_picture(page: "Page", run: Run) -> str:
     from vecpsmbpo.look import style
 
     columns = [lane.epochs["real_ratio_probs"] for lane in run.lanes if "real_ratio_probs" in lane.epochs]
-    if not columns or not isinstance(run.settings, PosteriorSettings):
+    if not columns:
         return ""
     shortest = min(map(len, columns))
     chances = np.mean([column[:shortest] for column in columns], axis=0)
     figure, (axes,) = style.grid(1, 1, (4.4, 2.9))
-    arms = run.settings.real_ratio_arms
+    arms = run.lanes[0].setting("real_ratio_arms")
     for look, arm, chance in zip(style.looks(len(arms), ordered=True), arms, chances.T, strict=True):
         style.line(axes, look, run.lanes[0].epochs["env_steps"][:shortest], chance, label=f"λ = {arm:g}")
-    style.steps_axis(axes, AXES["env_steps"])
+    style.steps_axis(axes, STEPS)
     axes.set_ylabel("probability")
     style.legend(figure, axes, columns=3)
     return page.picture(figure, "how likely each λ is the best (mean over seeds)")

@@ -63,6 +63,10 @@ class Lane:
         """Columns of episodes.jsonl, [E] each; `probs` [E, N·M]."""
         return self.run.of_lane(self.values)
 
+    def setting(self, name: str) -> Any:
+        """The value that it has of a setting, swept or its run's; None where its algorithm has no such setting."""
+        return self.values.get(name, getattr(self.run.settings, name, None))
+
 
 @dataclass(frozen=True)
 class Run:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from vecpsmbpo.settings.fields import choice, is_traced, real, whole
+from vecpsmbpo.settings.fields import choice, real, whole
 
 Options = tuple[tuple[str, Any], ...]  # name and value of each `env.*` option, in the order of names
 Sweep = tuple[tuple[str, tuple[float, ...]], ...]  # name and values of each `sweep.*`, in the order of names
@@ -54,7 +54,6 @@ class Settings:
     # real data
     warmup_steps: int = whole(1)
     replay_capacity: int = whole(1)
-    forced_exploration: float = real(0, traced=True)
     # dynamics models (A.1)
     n_models: int = whole(1)
     model_hidden_size: int = whole(1)
@@ -69,6 +68,8 @@ class Settings:
     validation_ratio: float = real(0, 0.5, open_low=True)
     whiten_targets: bool
     prior_scale: float = real(0, traced=True)
+    # who acts
+    forced_exploration: float = real(0, traced=True)
 
     @property
     def task(self) -> str:
@@ -76,7 +77,7 @@ class Settings:
         return " ".join([self.env, *(str(value) for _, value in self.env_options)])
 
     @property
-    def scale(self) -> str:
+    def summary(self) -> str:
         """How much learns, in words."""
         return f"N = {self.n_models} model(s)"
 
@@ -100,6 +101,21 @@ class Settings:
         """Whether members are drawn by what their critics promise, and not by what they have earned."""
         return False
 
+    @property
+    def plans_actions(self) -> bool:
+        """Whether actions are planned in the models; there is no policy then."""
+        return False
+
+    @property
+    def learns_by_sac(self) -> bool:
+        """Whether every member is an agent of `sac`, whose actor and critics can be asked by themselves."""
+        return False
+
+    @property
+    def averages_members(self) -> bool:
+        """Whether all members act together, and none is drawn."""
+        return False
+
     @functools.cached_property
     def lanes(self) -> tuple[dict[str, Any], ...]:
         """The S learners of the program: every seed with every combination of swept values, as log lines name them."""
@@ -107,11 +123,6 @@ class Settings:
         names = [name for name, _ in self.sweep]
         points = itertools.product(*(values for _, values in self.sweep))
         return tuple({**seed, **dict(zip(names, point, strict=True))} for point in points for seed in seeds)
-
-    @property
-    def traced(self) -> tuple[str, ...]:
-        """The settings that are numbers inside the compiled program (`types.Hyper`)."""
-        return tuple(field.name for field in dataclasses.fields(self) if is_traced(field))
 
     @property
     def has_prior(self) -> bool:

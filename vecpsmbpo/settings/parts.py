@@ -13,7 +13,6 @@ class PolicySettings(Settings):
 
     policy_hidden_size: int = whole(1)
     policy_hidden_layers: int = whole(1)
-    discount: float = real(0, 1, traced=True)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,6 +24,7 @@ class SacSettings(PolicySettings):
     policy_learning_rate_decay_steps: int = whole(1)
     policy_batch_size: int = whole(1)
     updates_per_step: int = whole(1)
+    discount: float = real(0, 1, traced=True)
     target_entropy: float = real(traced=True)
     target_update_rate: float = real(0, 1, open_low=True, traced=True)
     target_update_every: int = whole(1)
@@ -35,6 +35,10 @@ class SacSettings(PolicySettings):
     @property
     def minibatch(self) -> int:
         return self.policy_batch_size
+
+    @property
+    def learns_by_sac(self) -> bool:
+        return True
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,7 +61,7 @@ class ImaginationSettings(SacSettings):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PosteriorSettings(Settings):
-    """Of `posterior` and `mixture`: who acts, and from how much real data each learns."""
+    """Of `posterior` and `mixing`: who acts, and from how much real data each learns."""
 
     n_policies: int = whole(1)
     real_ratio: float = real(0, 1, traced=True)
@@ -80,6 +84,10 @@ class PosteriorSettings(Settings):
     def weighs_values(self) -> bool:
         return self.weights == "values"
 
+    @property
+    def averages_members(self) -> bool:
+        return self.posterior == "average"
+
     def may_change(self, name: str) -> bool:
         falls = self.real_ratio_schedule == "linear"  # over the whole run
         return super().may_change(name) and not (falls and name == "total_steps")
@@ -101,6 +109,6 @@ class PosteriorSettings(Settings):
         )
         yield list(self.real_ratio_arms) != sorted(set(self.real_ratio_arms)), f"real_ratio_arms=[{arms}]: must rise"
         yield (
-            self.adapts_real_ratio and self.posterior == "average",
+            self.adapts_real_ratio and self.averages_members,
             "posterior=average: no policy earns what real_ratio_schedule=bandit would choose by",
         )

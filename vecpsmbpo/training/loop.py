@@ -71,7 +71,8 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
             _check_not_emptied(run_dir)
         stop = around.enter_context(heeding_signals()) if stop is None else stop
         crash.doing(_among("making the first state"), run_dir)
-        status = _Session(settings, driver, shapes, memory).go(stop)
+        with contextlib.ExitStack() as opened:
+            status = _Session(settings, driver, shapes, memory, opened).go(stop)
         processes.greatest(0)  # whoever left before the first has written its last would take it along
         return status
 
@@ -79,12 +80,19 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
 class _Session:
     """One session of a run: from a checkpoint, or from nothing, to its end or a signal."""
 
-    def __init__(self, settings: Settings, driver: Driver, shapes: TrainState, memory: str):
+    def __init__(
+        self, settings: Settings, driver: Driver, shapes: TrainState, memory: str, opened: contextlib.ExitStack
+    ):
+        """
+        Args:
+            opened: closes what is opened here.
+        """
         self.settings, self.driver = settings, driver
         self.run_dir = Path(settings.run_dir)
         keep = settings.keep_checkpoints
         with processes.together():
             self.checkpoints = checkpoint.Checkpoints(self.run_dir / checkpoint.FOLDER, settings, keep=keep)
+            opened.callback(self.checkpoints.close)
             saved = self.checkpoints.restore(shapes, driver.layout, warn=_warn)
             if saved and saved.step > settings.total_steps:
                 raise SettingError(f"total_steps={settings.total_steps}: the run has already done {saved.step}")
@@ -104,6 +112,7 @@ class _Session:
                 config.save(settings, self.run_dir)  # now that it is known to be the run's own
                 marks = saved.host.get("logs", {}) if saved else {}
                 self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn, marks)
+                opened.callback(self.log.close)
         self.display = Display(driver.algorithm, self.env_steps, None if processes.is_first() else Console(quiet=True))
         self.stopped_by = 0  # the signal that any process was sent
         self.memory = memory
@@ -136,9 +145,6 @@ class _Session:
             return self._failed(f"at step {error.step}", error)
         except SimulatorError as error:
             return self._failed(f"in the evaluation at step {self.env_steps}", error)
-        finally:
-            self.log.close()
-            self.checkpoints.close()
 
     def _asked_to(self, stop: Stop) -> bool:
         """Whether signals have asked any process to stop; saves first, if it is that which they asked for."""
@@ -159,7 +165,7 @@ class _Session:
         swept = "".join(f"{len(values)} values of {name} × " for name, values in settings.sweep)
         self.display.say(
             f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × {swept}"
-            f"{settings.scale}, on {layout.mesh.size} {jax.default_backend()} device(s)"
+            f"{settings.summary}, on {layout.mesh.size} {jax.default_backend()} device(s)"
         )
         self.display.say(f"memory: {self.memory}")
         where = f"resuming at step {self.env_steps}" if self.env_steps else "starting"
@@ -250,7 +256,7 @@ class _Session:
 
     def _epoch_lines(self) -> list[metrics.Line]:
         state = processes.here(self.state.without_rings())
-        return metrics.epoch_lines(placement.unpad(self.driver.layout, state), self.settings)
+        return metrics.epoch_lines(placement.unpad(self.driver.layout, state), self.driver.algorithm)
 
     def _note_frozen(self) -> None:
         """Says and writes which lanes were frozen in the chunk that ended."""

@@ -1,5 +1,6 @@
 """PETS for one seed: model-predictive control in the N models."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -62,14 +63,14 @@ class Pets(Algorithm):
     ) -> tuple[jax.Array, jax.Array]:
         """The action for obs [O] and the plan [H, A]; a new one where `due`, which must not be batched over seeds or
         episodes: a batched condition would plan always."""
-        settings, spec, layout = self.settings, self.spec, self.layout
+        settings = self.settings
+        earned = partial(planning.expected_returns, net=self.model_net, settings=settings, spec=self.spec)
 
         def value(plans, key):
             def part(plans, ids):
-                keys = jax.random.fold_in(key, ids[0])
-                return planning.expected_returns(models, obs, plans, keys, settings=settings, spec=spec)
+                return earned(models, obs, plans, jax.random.fold_in(key, ids[0]))
 
-            return layout.map_sharded(part, plans)
+            return self.layout.map_sharded(part, plans)
 
         def anew(plan):
             shifted = jnp.concatenate([plan[1:], jnp.zeros_like(plan[:1])])

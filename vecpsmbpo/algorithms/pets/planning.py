@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from vecpsmbpo import dynamics
 from vecpsmbpo.algorithms.pets.settings import PetsSettings
+from vecpsmbpo.networks import GaussianMLP
 from vecpsmbpo.types import EnvSpec, Model
 
 INITIAL_VARIANCE = 0.25  # of actions in [-1, 1]: (range / 4)²
@@ -55,6 +56,7 @@ def expected_returns(
     plans: Float[Array, "K H A"],
     key: PRNGKeyArray,
     *,
+    net: GaussianMLP,
     settings: PetsSettings,
     spec: EnvSpec,
 ) -> Float[Array, " K"]:
@@ -69,7 +71,7 @@ def expected_returns(
         plans: each action is held for `plan_hold` steps.
     """
     count, particles, n_models = plans.shape[0], settings.plan_particles, settings.n_models
-    predict = partial(dynamics.predict, net=dynamics.network(settings, spec), spec=spec)
+    predict = partial(dynamics.predict, net=net, spec=spec)
 
     def step(carry, xs):
         obs, alive, total = carry

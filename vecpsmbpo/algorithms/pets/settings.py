@@ -19,6 +19,10 @@ class PetsSettings(Settings):
     plan_iterations: int = whole(1)
     plan_particles: int = whole(1)
 
+    @property
+    def plans_actions(self) -> bool:
+        return True
+
     def contradictions(self) -> Iterator[tuple[bool, str]]:
         yield from super().contradictions()
         yield (

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vecpsmbpo import health, imagination, mixture, posterior, replay, sac
+from vecpsmbpo import health, imagination, mixing, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
 from vecpsmbpo.sac import Agent
-from vecpsmbpo.types import Bandit, Counters, Hyper, Params, Posterior, SeedState, Transition
+from vecpsmbpo.types import Bandit, Counters, Hyper, Params, Posterior, SeedState, Transition, Whole
 
 
 class Evidence(struct.PyTreeNode):
@@ -47,6 +47,9 @@ class PsMbpo(Algorithm):
     def ring_capacity(self) -> int:
         return imagination.ring_capacity(self.settings)
 
+    def retained_rows(self, env_steps: Whole) -> jax.Array:
+        return imagination.retained_rows(self.settings, env_steps)
+
     def working_bytes(self, row: int) -> int:
         """Minibatches of a step, or rows in flight of a rollout."""
         settings = self.settings
@@ -61,24 +64,31 @@ class PsMbpo(Algorithm):
             state = state.replace(episode=state.episode.replace(values=unknown))
         else:
             starts = None
-        return state.replace(own=Evidence(starts, mixture.init(settings) if settings.adapts_real_ratio else None))
+        return state.replace(own=Evidence(starts, mixing.init(settings) if settings.adapts_real_ratio else None))
+
+    def numbers(self, counters: Counters, state: SeedState) -> dict[str, Any]:
+        """λ, of several members their mean, and τ; where λ is chosen online, how likely each is the best."""
+        bandit = state.own.bandit
+        ratio = np.asarray(self.real_ratios(counters, state), np.float64).mean()
+        chosen = {} if bandit is None else {"real_ratio_probs": mixing.probabilities(bandit)}
+        return {"real_ratio": ratio, "temperature": state.hyper.temperature, **chosen}
 
     # ── who acts: once an episode ────────────────────────────────────────────────────────────────────────────
 
     def draw(self, members: Posterior, values: Any, hyper: Hyper, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """A member by equation 18 or 19; with `posterior=average` none, -1."""
         member, probs = posterior.draw(posterior.logits(members, values, hyper.temperature), key)
-        return jnp.int32(-1) if self.settings.posterior == "average" else member, probs
+        return jnp.int32(-1) if self.settings.averages_members else member, probs
 
-    def credit(self, state: SeedState, episode_return: jax.Array, counts: jax.Array) -> SeedState:
+    def credit(self, state: SeedState, episode_return: jax.Array, enabled: jax.Array) -> SeedState:
         """To the member (equation 19) and, where λ is chosen online, to the λ that it learned with."""
         bandit = state.own.bandit
         if bandit is not None:
-            arm = mixture.arms_of_members(self.settings, bandit)[state.episode.member]
-            credited = mixture.credit(bandit, arm, episode_return)
-            known = jax.tree.map(partial(jnp.where, counts), credited, bandit)
+            arm = mixing.arms_of_members(self.settings, bandit)[state.episode.member]
+            credited = mixing.credit(bandit, arm, episode_return)
+            known = jax.tree.map(partial(jnp.where, enabled), credited, bandit)
             state = state.replace(own=state.own.replace(bandit=known))
-        return super().credit(state, episode_return, counts)
+        return super().credit(state, episode_return, enabled)
 
     def note_start(self, state: SeedState, obs: jax.Array) -> SeedState:
         starts = posterior.add_start(state.own.starts, state.episode, obs)
@@ -89,7 +99,7 @@ class PsMbpo(Algorithm):
     def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
         """An action sampled from the policy of the episode's member, or with `posterior=average` from all members'."""
         actors = state.agents.actor
-        if self.settings.posterior == "average":
+        if self.settings.averages_members:
             return self._of_mixture(actors, obs, key), ()
         return self._of_member(state.episode.member, actors, obs, key), ()
 
@@ -137,8 +147,8 @@ class PsMbpo(Algorithm):
             q = jnp.minimum(*nets.critic.values(agent.critic, starts, action))
             return jnp.sum(jnp.where(known, q, 0.0)) / jnp.sum(known)
 
-        limits = sac.Limits(moments.lowest_reward, moments.highest_reward)
-        least, most = sac.target_range(limits, jnp.float32(0.0), state.hyper, self.spec.action_size)
+        reward_range = sac.RewardRange(moments.lowest_reward, moments.highest_reward)
+        least, most = sac.target_range(reward_range, jnp.float32(0.0), state.hyper, self.spec.action_size)
         return jnp.clip(self.layout.all_members(jax.vmap(value)(state.agents)), least, most)
 
     def _of_member(
@@ -163,13 +173,13 @@ class PsMbpo(Algorithm):
     @property
     def _evaluates_all(self) -> bool:
         # Nobody earns anything where all act together: there is no best member either, and all are it.
-        return "average" in (self.settings.eval_policy, self.settings.posterior)
+        return self.settings.averages_members or self.settings.eval_policy == "average"
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
     def real_ratios(self, counters: Counters, state: SeedState) -> jax.Array:
         """[N·M] the λ of each member now."""
-        return mixture.real_ratios(self.settings, state.hyper, state.own.bandit, counters.env_steps)
+        return mixing.real_ratios(self.settings, state.hyper, state.own.bandit, counters.env_steps)
 
     def refreshes(self, counters: Counters, state: SeedState) -> jax.Array:
         """Whether any member may learn from imagined data, [] bool, in the period that begins: λ may fall from 1 within
@@ -210,29 +220,31 @@ class PsMbpo(Algorithm):
             draw = partial(imagination.start_states, state.real, counters.env_steps, count=chunk, spec=spec)
             return jax.vmap(draw)(keys)
 
+        imagined_step = partial(imagination.step, net=self.model_net, nets=self.nets, settings=settings, spec=spec)
+
         def advance(model, actor, obs, fresh, key):
-            transition = imagination.step(model, actor, obs, key, settings=settings, spec=spec)
+            transition = imagined_step(model, actor, obs, key)
             return replay.pack(transition), jnp.where(transition.terminated[:, None], fresh, transition.next_obs)
 
         def step(t, carry):
-            imagined, sound, obs, rows, key = carry
+            imagined, sound, obs, added, key = carry
             keys = jax.vmap(jax.random.split)(layout.keys(jax.random.fold_in(key, t), ids))
             fresh = real_states(keys[:, 1])
-            rows_now, obs = layout.map_local(advance, models, state.agents.actor, obs, fresh, keys[:, 0])
-            finite = jnp.all(jnp.isfinite(rows_now), axis=-1)
-            imagined = replay.add(imagined, jnp.where(finite[..., None], rows_now, 0.0), rows)
-            return imagined, sound & jnp.all(finite, axis=-1), obs, rows + chunk, key
+            rows, obs = layout.map_local(advance, models, state.agents.actor, obs, fresh, keys[:, 0])
+            finite = jnp.all(jnp.isfinite(rows), axis=-1)
+            imagined = replay.add(imagined, jnp.where(finite[..., None], rows, 0.0), added)
+            return imagined, sound & jnp.all(finite, axis=-1), obs, added + chunk, key
 
         def rollout(c, carry):
-            imagined, sound, rows = carry
+            imagined, sound, added = carry
             start_key, step_key = jax.random.split(jax.random.fold_in(key, c))
             obs = real_states(layout.keys(start_key, ids))
-            imagined, sound, _, rows, _ = jax.lax.fori_loop(0, horizon, step, (imagined, sound, obs, rows, step_key))
-            return imagined, sound, rows
+            imagined, sound, _, added, _ = jax.lax.fori_loop(0, horizon, step, (imagined, sound, obs, added, step_key))
+            return imagined, sound, added
 
         start = (state.imagined, jnp.ones(ids.shape, bool), counters.imagined_rows)
-        imagined, sound, rows = jax.lax.fori_loop(0, chunks, rollout, start)
-        counters = counters._replace(imagined_rows=replay.count(rows, self.ring_capacity))
+        imagined, sound, added = jax.lax.fori_loop(0, chunks, rollout, start)
+        counters = counters._replace(imagined_rows=replay.wrapped(added, self.ring_capacity))
         sound |= ids >= layout.n_members
         first = layout.least_of_members(jnp.min(jnp.where(sound, layout.n_members, ids)))
         noted = health.note(state.health, health.IMAGINED, first < layout.n_members, first)
@@ -256,17 +268,15 @@ class PsMbpo(Algorithm):
         batches, noise = layout.part((batches, noise), axis=2)
 
         moments = state.moments
-        limits = sac.Limits(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
+        reward_range = sac.RewardRange(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
         rate = sac.learning_rate(settings, state.hyper.policy_learning_rate, counters.env_steps)
         hyper = state.hyper.replace(policy_learning_rate=rate)
 
-        def update(agent, batches, noise, hyper, limits):
-            every = settings.target_update_every
-            return sac.updates(
-                agent, batches, noise, hyper, nets=nets, limits=limits, target_every=every, mean=layout.mean_of_parts
-            )
+        def update(agent, batches, noise, hyper, reward_range):
+            how = {"target_every": settings.target_update_every, "mean": layout.mean_of_parts}
+            return sac.updates(agent, batches, noise, hyper, nets=nets, reward_range=reward_range, **how)
 
-        return layout.map_local(update, state.agents, batches, noise, shared=(hyper, limits))
+        return layout.map_local(update, state.agents, batches, noise, shared=(hyper, reward_range))
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings
@@ -283,7 +293,7 @@ class PsMbpo(Algorithm):
         shape = (self.settings.updates_per_step, self.settings.policy_batch_size)
         source_key, real_key, imagined_key = jax.random.split(key, 3)
         real_index = replay.sample_indices(real_key, shape, counters.env_steps, state.real.shape[0])
-        newest = imagination.retained_rows(self.settings, counters.env_steps)
+        newest = self.retained_rows(counters.env_steps)
         imagined_index = replay.sample_newest_indices(
             imagined_key, shape, counters.imagined_rows, imagined.shape[0], newest
         )

@@ -11,7 +11,7 @@ class PsMbpoSettings(PosteriorSettings, ImaginationSettings):
     """Policies that learn by SAC from real and imagined data."""
 
     @property
-    def scale(self) -> str:
+    def summary(self) -> str:
         where = " in all of them" if self.rollout_models == "any" else ""
         members = f"N = {self.n_models} models × M = {self.n_policies} policies{where}"
         return f"{members}, {self.updates_per_step} updates per step"
@@ -23,14 +23,20 @@ class PsMbpoSettings(PosteriorSettings, ImaginationSettings):
 
     def contradictions(self) -> Iterator[tuple[bool, str]]:
         yield from super().contradictions()
-        if self.algo == "sac":  # one policy, real data alone (λ = 1, equation 15)
-            for name in ("n_models", "n_policies"):
-                yield getattr(self, name) != 1, f"{name}={getattr(self, name)}: must be 1 with algo=sac"
-            moves = self.real_ratio_schedule != "constant" or "real_ratio" in dict(self.sweep)
-            yield moves or self.real_ratio != 1, "real_ratio: must be 1 with algo=sac, and stay there"
-            return
         longest = max(self.horizon_first, self.horizon_last)
         yield (
-            self.imagined_capacity < longest,
+            self.imagines and self.imagined_capacity < longest,
             f"imagined_capacity={self.imagined_capacity}: must hold a rollout, of up to {longest} steps",
         )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RealDataSettings(PsMbpoSettings):
+    """SAC: one policy, which learns from real data alone (λ = 1, equation 15)."""
+
+    def contradictions(self) -> Iterator[tuple[bool, str]]:
+        for name in ("n_models", "n_policies"):
+            yield getattr(self, name) != 1, f"{name}={getattr(self, name)}: must be 1 with algo={self.algo}"
+        moves = self.real_ratio_schedule != "constant" or "real_ratio" in dict(self.sweep)
+        yield moves or self.real_ratio != 1, f"real_ratio: must be 1 with algo={self.algo}, and stay there"
+        yield from super().contradictions()

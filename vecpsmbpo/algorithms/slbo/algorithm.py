@@ -53,14 +53,15 @@ class Slbo(Algorithm):
         """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""
         layout = self.layout
         whitening = dynamics.scaling(state.moments, counters.env_steps, self.settings)
+        fit = partial(multistep.fit, net=self.model_net, settings=self.settings, spec=self.spec)
 
         def learn(model, agent, key, counters, real, whitening, hyper):
-            rows = counters.env_steps
+            added = counters.env_steps
 
             def round_(learned, key):
                 model, agent = learned
                 model_key, policy_key = jax.random.split(key)
-                model = multistep.fit(model, real, rows, hyper, model_key, settings=self.settings, spec=self.spec)
+                model = fit(model, real, added, hyper, model_key)
 
                 def policy_step(agent, key):
                     rollout_key, update_key = jax.random.split(key)
@@ -91,7 +92,8 @@ class Slbo(Algorithm):
         SLBO's code starts them from the environment's initial states, which a model cannot draw.
         """
         settings, spec = self.settings, self.spec
-        net, count, length = dynamics.network(settings, spec), settings.policy_rollouts, settings.policy_rollout_length
+        count, length = settings.policy_rollouts, settings.policy_rollout_length
+        predict = partial(dynamics.predict, net=self.model_net, spec=spec, sampled=False)
 
         def real_states(key):
             return imagination.start_states(real, counters.env_steps, key, count, spec)
@@ -103,7 +105,7 @@ class Slbo(Algorithm):
             t, key = xs
             action_key, model_key, fresh_key = jax.random.split(key, 3)
             action = self.nets.policy.distribution(policy, seen(obs)).sample(action_key)
-            answer = dynamics.predict_mean(model, obs, jnp.clip(action, -1.0, 1.0), model_key, net=net, spec=spec)
+            answer = predict(model, obs, jnp.clip(action, -1.0, 1.0), model_key)
             ended = answer.terminated | (t == length - 1)
             terminated = answer.terminated.astype(jnp.float32)
             row = trpo.Rollouts(seen(obs), action, answer.reward, seen(answer.next_obs), terminated, ended)

@@ -18,6 +18,7 @@ class SlboSettings(PolicySettings):
     policy_rollouts: int = whole(1)
     policy_rollout_length: int = whole(1)
     trust_region: float = real(0, open_low=True)
+    discount: float = real(0, 1, traced=True)
     gae_decay: float = real(0, 1)
     entropy_weight: float = real(0)
 

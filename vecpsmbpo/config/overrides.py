@@ -1,0 +1,112 @@
+"""What a command line says, word by word: each `name=value` checked by itself, before anything is composed."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+
+from vecpsmbpo.algorithms.catalogue import FIELDS, check, check_sweep, require
+from vecpsmbpo.config.choices import GROUPS, closest, default, env_options, options
+from vecpsmbpo.settings import SettingError
+
+
+def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
+    """Checks each override on its own: its name, and what its value may be.
+
+    Args:
+        overrides: `name=value` each.
+        sweep: values may be several, as Hydra's multirun has them.
+
+    Returns:
+        Value by name.
+
+    Raises:
+        SettingError: what is wrong with the first wrong one.
+    """
+    found: dict[str, Any] = {}
+    algorithms: list[str] = []
+    for text in overrides:
+        if "=" not in text:
+            raise SettingError(f"{text}: must be name=value")
+        try:
+            override = OverridesParser.create().parse_override(text)
+        except HydraException as error:
+            raise SettingError(f"{text}: is not a value that can be read ({first_line(error)})") from None
+        name = override.key_or_group
+        if override.is_delete():
+            raise SettingError(f"{text}: a setting cannot be taken away; give it another value")
+        if sweep and name.startswith("hydra"):
+            continue
+        if override.is_sweep_override() and not sweep:
+            raise SettingError(f"{text}: several values need -m")
+        values = _sweep_values(override) if override.is_sweep_override() else [override.value()]
+        if len(set(map(str, values))) < len(values):
+            raise SettingError(f"{text}: the same value twice")
+        for value in values:
+            found[name] = check_override(name, value)
+            algorithms += [str(value)] if name == "algo" else []
+    if "experiment" in found and not sweep:
+        raise SettingError(f"experiment={found['experiment']}: is a grid of runs and needs -m")
+    _check_env_options(found)
+    if sweep and "experiment" not in found:
+        for algo in algorithms or [default("algo")]:
+            check_algorithm(algo, found)
+    return found
+
+
+def _check_env_options(found: dict[str, Any]) -> None:
+    """That the task has the options given; a run that is resumed knows its task by itself."""
+    given = [name for name in found if name.startswith("env.")]
+    if "env" not in found and "run_dir" in found:
+        return
+    for name in given:
+        env = found.get("env", default("env"))
+        if name.removeprefix("env.") not in env_options(env):
+            has = ", ".join(f"env.{option}" for option in env_options(env)) or "none"
+            raise SettingError(f"{name}: no such option of env={env}; it has {has}")
+
+
+def check_env_values(env: str, given: Mapping[str, Any]) -> None:
+    """That the options of a task have the types of their defaults; one that must be given is a name."""
+    for name, usual in env_options(env).items():
+        value = given.get(name, usual)
+        if isinstance(usual, str):
+            wrong, what = not isinstance(value, str) or not value, "a name"
+        else:
+            wrong, what = isinstance(value, bool) or not isinstance(value, int | float), "a number"
+        if wrong:
+            raise SettingError(f"env.{name}={value}: must be {what}")
+
+
+def check_algorithm(algo: str, names: Iterable[str]) -> None:
+    """That the algorithm has the settings given."""
+    for name in names:
+        require(algo, name)
+
+
+def _sweep_values(override: Override) -> list[Any]:
+    values = list(override.sweep_iterator())
+    return [yaml.safe_load(value) if isinstance(value, str) else value for value in values]
+
+
+def check_override(name: str, value: Any) -> Any:
+    """`value` as the type of what `name` says, a setting or a group."""
+    if name in (*GROUPS, "experiment"):
+        if value not in options(name):
+            raise SettingError(f"{name}={value}: {closest(str(value), options(name))}")
+        return value
+    if name.startswith("env."):
+        return value
+    if name.startswith("sweep."):
+        return check_sweep(name.removeprefix("sweep."), value)
+    if name not in FIELDS:
+        raise SettingError(f"{name}: no such setting; {closest(name, FIELDS)}")
+    return check(name, "" if value is None and FIELDS[name].type is str else value)
+
+
+def first_line(error: Exception) -> str:
+    """Of what an error says."""
+    return (str(error).strip() or repr(error)).splitlines()[0]
