@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from tests import devices
-from vecpsmbpo import algorithms, config, metrics
+from vecpsmbpo import algorithms, config, evaluate, metrics, placement
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.settings import Settings
@@ -91,6 +91,30 @@ def check_log(run_dir: Path, settings) -> None:
         assert np.allclose([np.sum(line["probs"]) for line in own], 1.0, atol=1e-5)
     assert all(set(line) >= METRICS | set(names) for line in epochs)
     assert list((run_dir / "tensorboard").iterdir())
+
+
+def without_times(lines: list[dict]) -> list[dict]:
+    """Lines without what depends on the clock."""
+    clock = {"env_steps_per_s", "updates_per_s", "imagined_per_s", "seconds", "compile_seconds"}
+    return [{name: value for name, value in line.items() if name not in clock} for line in lines]
+
+
+def final_parameters(run_dir: Path) -> list[np.ndarray]:
+    """Every array of the newest checkpoint's state."""
+    settings = config.load(run_dir)
+    driver, saved = evaluate.restore(settings)
+    assert saved.step == settings.total_steps
+    leaves = jax.tree.leaves(placement.unpad(driver.layout, saved.state))
+    is_key = lambda x: jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    return [np.asarray(jax.random.key_data(leaf) if is_key(leaf) else leaf) for leaf in leaves]
+
+
+def assert_same_run(run_dir: Path, other: Path) -> None:
+    for ours, theirs in zip(final_parameters(run_dir), final_parameters(other), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    for file in ("metrics.jsonl", "episodes.jsonl"):
+        assert without_times(metrics.read(run_dir / file)) == without_times(metrics.read(other / file))
+    check_log(run_dir, config.load(run_dir))
 
 
 def assert_probabilities_follow(lines: list[dict], n_models: int, settings: Settings) -> np.ndarray:

@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from tests import probes
-from tests.helpers import algorithm, argv, initial, tiny
-from tests.test_resume import without_times
+from tests.helpers import algorithm, argv, initial, tiny, without_times
 from vecpsmbpo import checkpoint, evaluate, health, jsonl, placement, replay, training
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.settings import Settings

@@ -8,8 +8,7 @@ import time
 
 import pytest
 
-from tests.helpers import argv, environment
-from tests.test_resume import without_times
+from tests.helpers import argv, environment, without_times
 from vecpsmbpo import cli, jsonl, processes
 from vecpsmbpo.drivers import host
 from vecpsmbpo.envs.host.batched import SimulatorError

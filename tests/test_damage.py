@@ -1,0 +1,289 @@
+"""Runs whose files are damaged, lost or cannot be written: what the loop around the program makes of it."""
+
+import dataclasses
+import errno
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import vecpsmbpo
+from tests.helpers import (
+    assert_same_run,
+    check_log,
+    command,
+    tiny,
+)
+from vecpsmbpo import config, evaluate, jsonl, metrics, placement, recorded, training
+from vecpsmbpo.envs.host.dm_control import DmControlSimulator
+from vecpsmbpo.settings import SettingError
+from vecpsmbpo.training import guards
+from vecpsmbpo.types import Hyper
+
+
+@pytest.fixture(scope="module")
+def short_run(tmp_path_factory):
+    """A finished host run of this process, and its settings."""
+    folder = tmp_path_factory.mktemp("short")
+    settings = tiny(env="ball_in_cup", backend="host", run_dir=folder / "run")
+    assert training.train(settings) == 0
+    return settings
+
+
+@pytest.mark.parametrize("posterior", ["sample", "average"])
+def test_a_policy_is_loaded_from_a_run(posterior, short_run, tmp_path, monkeypatch):
+    """Of the best member, or of all where they act together; mean actions against a forward pass written in numpy."""
+    monkeypatch.setattr(recorded, "check", lambda *args: None)  # it was trained with one of them
+    shutil.copytree(short_run.run_dir, tmp_path / "run")
+    config.save(dataclasses.replace(short_run, posterior=posterior, run_dir=str(tmp_path / "run")), tmp_path / "run")
+    run = vecpsmbpo.load(tmp_path / "run")
+    settings, act = run.settings, run.policy
+    assert settings == config.load(tmp_path / "run")
+    driver, saved = evaluate.restore(settings)
+    seeds = placement.unpad(driver.layout, saved.state).seeds
+    layers = jax.tree.map(lambda x: np.asarray(x[0], float), seeds.agents.actor)["params"]["ReluMLP_0"]
+    obs = np.random.default_rng(0).normal(size=(3, 8))
+
+    def mean_actions(member):
+        dense = [
+            (layer["kernel"][member], layer["bias"][member])
+            for layer in (layers[f"Dense_{index}"] for index in range(settings.policy_hidden_layers + 1))
+        ]
+        hidden = obs
+        for kernel, bias in dense[:-1]:
+            hidden = np.maximum(hidden @ kernel + bias, 0)
+        return np.tanh((hidden @ dense[-1][0] + dense[-1][1])[:, :2])
+
+    earned, episodes = (np.asarray(x[0], float) for x in (seeds.posterior.returns, seeds.posterior.episodes))
+    mean = np.where(episodes >= max(1, episodes.mean() / 2), earned / np.maximum(episodes, 1), -np.inf)
+    members = [int(mean.argmax())] if posterior == "sample" else range(settings.n_members)
+    np.testing.assert_allclose(act(obs), np.mean([mean_actions(member) for member in members], axis=0), atol=1e-5)
+
+
+def _damage(run_dir: Path, step: int) -> None:
+    """Cuts every file of a checkpoint's arrays in half."""
+    for file in (run_dir / "checkpoints" / str(step) / "state").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def _files(run_dir: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in run_dir.rglob("*") if path.is_file()}
+
+
+def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(short_run, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    settings = dataclasses.replace(short_run, run_dir=str(folder))
+    _damage(folder, 120)
+    before = _files(folder)
+    assert evaluate.restore(settings)[1].step == 80
+    assert _files(folder) == before  # looking at a run changes nothing
+    assert training.train(settings) == 0
+    printed = capsys.readouterr()
+    assert "the checkpoint at step 120 is damaged; taking the one before it" in printed.err
+    assert "resuming at step 80" in printed.out
+    check_log(folder, short_run)
+    assert evaluate.restore(settings)[1].step == 120
+
+
+def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    _damage(folder, 120)
+    _damage(folder, 80)
+    logs = {name: (folder / name).read_bytes() for name in ("metrics.jsonl", "episodes.jsonl")}
+    with pytest.raises(SettingError, match="holds checkpoints, but none that can be read"):
+        training.train(dataclasses.replace(short_run, run_dir=str(folder)))
+    assert {name: (folder / name).read_bytes() for name in logs} == logs
+    assert {path.name for path in (folder / "checkpoints").iterdir()} >= {"80", "120"}
+
+
+def _flip(path: Path, at: float = 0.5, bit: int = 4) -> None:
+    """One bit, at a fraction of a file."""
+    content = bytearray(path.read_bytes())
+    content[int(at * len(content))] ^= 1 << bit
+    path.write_bytes(content)
+
+
+def _host(run_dir: Path, step: int) -> Path:
+    """What the host knows beside the state, in a checkpoint."""
+    return run_dir / "checkpoints" / str(step) / "host" / "metadata"
+
+
+def test_a_flipped_bit_is_a_damaged_checkpoint(short_run, tmp_path, capsys):
+    """In the largest arrays, where it would change a number and nothing else; and in what the host knows."""
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    settings = dataclasses.replace(short_run, run_dir=str(folder))
+    files = (path for path in (folder / "checkpoints" / "120" / "state").rglob("*/0*") if path.is_file())
+    largest = sorted(files, key=lambda path: path.stat().st_size)[-3:]
+    for file, at in [*((file, at) for file in largest for at in (0.4, 0.8)), (_host(folder, 120), 0.5)]:
+        whole = file.read_bytes()
+        _flip(file, at)
+        assert evaluate.restore(settings)[1].step == 80, file
+        file.write_bytes(whole)
+    assert "the checkpoint at step 120 is damaged; taking the one before it" in capsys.readouterr().err
+    assert evaluate.restore(settings)[1].step == 120
+
+
+def test_a_checkpoint_from_before_it_knew_its_settings_is_read(short_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    for step in (80, 120):
+        host = json.loads(_host(folder, step).read_text())
+        _host(folder, step).write_text(json.dumps({name: host[name] for name in ("env", "seconds", "format")}))
+    assert training.train(dataclasses.replace(short_run, run_dir=str(folder), total_steps=160)) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"seed": 5}, r"its checkpoints were made with seed=0 \(not 5\); put config.yaml right, or give another"),
+        ({"algo": "mbpo", "temperature": 3.0}, r"made with algo=ops_mbpo \(not mbpo\), temperature="),
+        ({"model_hidden_size": 7}, r"made with model_hidden_size=\d+ \(not 7\);"),  # another shape is no damage
+        ({"total_steps": 80}, r"total_steps=80: the run has already done 120"),
+    ],
+)
+def test_settings_that_are_not_the_checkpoints_are_refused_and_nothing_changes(changes, expected, short_run, tmp_path):
+    """As an edited config.yaml has them, or a command where config.yaml is gone."""
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    (folder / "config.yaml").unlink()
+    before = _files(folder)
+    with pytest.raises(SettingError, match=expected):
+        training.train(dataclasses.replace(short_run, run_dir=str(folder), **changes))
+    assert _files(folder) == before
+    if changes == {"seed": 5}:
+        assert training.train(dataclasses.replace(short_run, run_dir=str(folder))) == 0  # the right ones
+        assert dataclasses.replace(config.load(folder), run_dir=short_run.run_dir) == short_run
+
+
+def test_a_run_whose_checkpoints_are_gone_does_not_begin_anew(short_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    shutil.rmtree(folder / "checkpoints")
+    before = _files(folder)
+    with pytest.raises(SettingError, match="its logs reach step 120, but its checkpoints are gone"):
+        training.train(dataclasses.replace(short_run, run_dir=str(folder)))
+    assert _files(folder) == before
+    assert not (folder / "checkpoints").exists()
+
+
+def test_what_is_wrong_with_the_logs_is_said_when_a_run_goes_on(short_run, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(short_run.run_dir, folder)
+    metrics_file, episodes_file = folder / "metrics.jsonl", folder / "episodes.jsonl"
+    first, second, third = metrics_file.read_bytes().splitlines(keepends=True)
+    metrics_file.write_bytes(first + b"[1, 2]\n" + second[:20] + b"\n" + third)
+    episodes_file.write_bytes(episodes_file.read_bytes()[: episodes_file.stat().st_size // 2])
+    assert training.train(dataclasses.replace(short_run, run_dir=str(folder))) == 0
+    assert metrics_file.read_bytes() == first + third
+    said = capsys.readouterr().err
+    assert f"{metrics_file}: 2 line(s) that cannot be read, set aside in metrics.jsonl.strange" in said
+    assert "of its lines up to step 120 are lost" in said
+    assert said.count("\n") == 2
+
+
+def test_a_simulator_that_fails_costs_its_stride_and_no_more(short_run, tmp_path, monkeypatch, capsys):
+    """One line, the state before the stride is saved, and the mended task goes on to the same end."""
+    settings, step = dataclasses.replace(short_run, run_dir=str(tmp_path / "a b=c")), DmControlSimulator.step
+    left = [66]  # steps, those of an evaluation included
+
+    def breaks(self, action):
+        left[0] -= 1
+        if left[0] < 0:
+            raise SystemExit(0)  # what would end the program as if all were well
+        return step(self, action)
+
+    monkeypatch.setattr(DmControlSimulator, "step", breaks)
+    assert training.train(settings) == 1
+    monkeypatch.undo()
+    said = capsys.readouterr()
+    saved = evaluate.restore(settings)[1].step
+    assert 0 < saved < 66
+    assert re.search(rf"ball_in_cup failed at step \d+: SystemExit: 0 at .*; saved at step {saved}; to cont", said.err)
+    assert said.err.rstrip().endswith(
+        """to continue: vecpsmbpo train 'run_dir='"'"'""" + str(tmp_path) + """/a b=c'"'"''"""
+    )
+    assert "Traceback" not in said.out + said.err
+    assert training.train(settings) == 0
+    assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
+
+
+def test_a_run_is_trained_by_one_process_at_a_time(short_run):
+    with guards.alone_in(Path(short_run.run_dir)), pytest.raises(SettingError, match="another process is training"):
+        training.train(short_run)
+
+
+def test_a_run_goes_on_where_the_system_has_no_locks(tmp_path, monkeypatch):
+    monkeypatch.setattr(guards, "fcntl", None)
+    with guards.alone_in(tmp_path), guards.alone_in(tmp_path / "not even looked at"):
+        pass
+
+
+def test_a_disk_that_fills_up_stops_the_run_in_one_line(short_run, tmp_path, monkeypatch):
+    """Not at the check before a save, but while a line is written; the checkpoint before it is whole."""
+    append = jsonl.Growing.append
+
+    def full(file, lines):
+        if any(line["env_steps"] > 60 for line in lines):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(file, lines)
+
+    monkeypatch.setattr(jsonl.Growing, "append", full)
+    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
+    with pytest.raises(training.DiskError, match=r"cannot be written \(No space left on device\)"):
+        training.train(settings)
+    monkeypatch.undo()
+    assert evaluate.restore(settings)[1].step == 40
+    assert training.train(settings) == 0
+    check_log(tmp_path / "run", settings)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small disk needs root")
+def test_a_full_disk_is_one_line_and_keeps_the_last_checkpoint(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], check=False).returncode:
+        pytest.skip("this sandbox does not let root mount")
+    try:
+        result = command("train", "env=ball_in_cup", "backend=host", "size=tiny", f"run_dir={disk}/run", cwd=tmp_path)
+        assert result.returncode == 2, result.stderr
+        expected = f"vecpsmbpo: run_dir={disk}/run: cannot be written (No space left on device)"
+        assert result.stderr.splitlines()[-1] == expected
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_log_files_drop_what_will_be_done_again(tmp_path):
+    lines = [{"env_steps": step, "seed": 0, "return": 1.0, "length": 5} for step in (10, 20, 30)]
+    path = tmp_path / "episodes.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"env_steps": 40, "se')
+    log = metrics.RunLog(tmp_path, 20, tiny(), warn=pytest.fail)
+    log.episodes([{"env_steps": 25, "seed": 0, "return": 2.0, "length": 5}])
+    log.close()
+    assert [line["env_steps"] for line in metrics.read(path)] == [10, 20, 25]
+
+
+@pytest.mark.parametrize(
+    ("algo", "own"),
+    [
+        ("ops_mbpo", "policy_learning_rate discount target_entropy target_update_rate real_ratio temperature"),
+        ("pets", ""),
+        ("slbo", "discount"),
+    ],
+)
+def test_what_may_be_swept_keeps_its_order_in_checkpoints(algo, own):
+    shared = "model_learning_rate model_weight_decay prior_scale forced_exploration"
+    everything = "policy_learning_rate discount target_entropy target_update_rate real_ratio temperature"
+    hyper = Hyper.of(tiny(algo=algo))
+    assert list(vars(hyper)) == f"{shared} {everything}".split()  # also of what the algorithm has not
+    leaves = jax.tree_util.tree_leaves_with_path(hyper)
+    assert [jax.tree_util.keystr(path) for path, _ in leaves] == [f".{name}" for name in f"{shared} {own}".split()]
