@@ -21,9 +21,12 @@ from tests.helpers import (
     tiny,
 )
 from vecpsmbpo import config, evaluate, jsonl, metrics, placement, recorded, training
+from vecpsmbpo.drivers.host import HostDriver
+from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.envs.host.dm_control import DmControlSimulator
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.training import guards
+from vecpsmbpo.training.loop import _Session
 from vecpsmbpo.types import Hyper
 
 
@@ -214,6 +217,35 @@ def test_a_simulator_that_fails_costs_its_stride_and_no_more(short_run, tmp_path
     )
     assert "Traceback" not in said.out + said.err
     assert training.train(settings) == 0
+    assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
+
+
+@pytest.mark.parametrize("failing", [80, 120])
+def test_a_simulator_that_fails_in_an_evaluation_costs_no_training(failing, short_run, tmp_path, monkeypatch, capsys):
+    """Of all that was trained since the last checkpoint nothing is lost, and the evaluation is made up for, though the
+    run that did so was killed before it saved anything."""
+    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"), checkpoint_every=5)
+    evaluated = HostDriver.evaluate
+
+    def fails(driver, state, *args):
+        if int(state.counters.env_steps) == failing:
+            raise SimulatorError("out of coal")
+        return evaluated(driver, state, *args)
+
+    monkeypatch.setattr(HostDriver, "evaluate", fails)
+    for _ in range(2):
+        assert training.train(settings) == 1
+        said = capsys.readouterr().err
+        assert f"failed in the evaluation at step {failing}: out of coal; saved at step {failing}; to cont" in said
+        assert jsonl.read(tmp_path / "run" / "metrics.jsonl")[-1]["env_steps"] == failing - 40
+    monkeypatch.undo()
+    if failing < settings.total_steps:
+        monkeypatch.setattr(_Session, "_chunk", os.kill)  # which wants arguments: an end without a save
+        with pytest.raises(TypeError):
+            training.train(settings)
+        monkeypatch.undo()
+    assert training.train(settings) == 0
+    assert capsys.readouterr().err == ""
     assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
 
 

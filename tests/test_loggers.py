@@ -6,8 +6,10 @@ import os
 import struct
 import threading
 import time
+from pathlib import Path
 
 import pytest
+from tensorboardX import record_writer
 
 from tests.helpers import command, tiny
 from vecpsmbpo import cli, config, loggers, metrics
@@ -102,6 +104,19 @@ def test_what_goes_wrong_with_a_logger_is_said_once(where, tmp_path, recorder, m
     assert said == ["loggers: the run goes on without wandb (the server is gone)"]
     assert len(metrics.read(tmp_path / "metrics.jsonl")) == 5
     assert list((tmp_path / "tensorboard").iterdir())
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a disk that is always full")
+def test_a_tensorboard_that_cannot_be_written_holds_nothing_up(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(record_writer, "open_file", lambda path: Path("/dev/full").open("wb"))  # noqa: SIM115
+    said = []
+    log = metrics.RunLog(tmp_path, 0, _settings("tensorboard"), said.append)
+    for step in range(1, 300):
+        log.metrics([_line(step)])
+    log.close()
+    assert said == ["loggers: the run goes on without tensorboard ([Errno 28] No space left on device)"]
+    assert len(metrics.read(tmp_path / "metrics.jsonl")) == 299
+    assert capfd.readouterr().err == ""
 
 
 def test_a_logger_that_fails_is_closed_and_told_what_it_missed_where_that_is_done_again(

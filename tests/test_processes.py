@@ -184,7 +184,7 @@ def test_a_simulator_that_fails_in_one_process_fails_in_all(here, monkeypatch):
             return "a step"
 
     if not here:
-        assert host._step_in_all(Failing(), None) == "a step"
+        assert host._in_all(lambda: Failing().step(None)) == "a step"
     monkeypatch.setattr(processes, "greatest", lambda failed: 1)
     with pytest.raises(SimulatorError, match="out of coal" if here else "failed in another process"):
-        host._step_in_all(Failing(), None)
+        host._in_all(lambda: Failing().step(None))

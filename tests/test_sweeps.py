@@ -17,13 +17,15 @@ from vecpsmbpo import cli, config, jsonl, metrics
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.stopping import heeding_submitit
 from vecpsmbpo.sweeps import launch, watch
-from vecpsmbpo.sweeps.job import Outcome, Run
+from vecpsmbpo.sweeps.job import Elsewhere, Outcome, Run
 
 SMALL = ["env=ball_in_cup", "backend=host", "size=tiny", "n_models=1", "n_policies=1", "loggers=[tensorboard]"]
 
 
 class Fake:
     """Jobs that end one at a time, each time they are looked at."""
+
+    at_signal = "asking them to end"
 
     def __init__(self, ends):
         self.ends, self.ended = ends, 0
@@ -55,6 +57,56 @@ def test_every_job_is_in_the_table_with_its_progress_and_its_status(tmp_path, mo
         ["2", "run2", "0/120", "–", "143"],
     ]
     assert [row[5].strip() for row in rows] == ["done", "ValueError: no", "stopped by signal 15"]
+
+
+class Far(Fake):
+    """Jobs that go on without the command; Ctrl-C comes while it looks at them."""
+
+    at_signal = "leaving them"
+
+    def look(self):
+        if self.ended == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return super().look()
+
+    def stop(self):
+        raise Elsewhere("the jobs go on without this command; scancel 7 ends them")
+
+
+def test_a_command_that_leaves_its_jobs_shows_how_far_they_are(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(watch, "LOOK_EVERY_S", 0.0)
+    console = Console(record=True, file=io.StringIO())
+    with pytest.raises(Elsewhere):
+        watch.follow(Far([Outcome(0)] * 4), runs(tmp_path, 4), console)
+    assert [line.split()[-1] for line in console.export_text().splitlines()[-4:]] == ["done"] * 2 + ["running"] * 2
+    assert capfd.readouterr().err.split("\n") == ["", "leaving them", ""]
+
+
+def program(path: Path, *lines: str) -> None:
+    path.write_text("\n".join(["#!/bin/sh", *lines]) + "\n")
+    path.chmod(0o755)
+
+
+def test_a_slurm_without_accounting_is_asked_for_its_queue(tmp_path, monkeypatch, capfd):
+    """submitit would never hear of a job that was killed, and print an error each time."""
+    monkeypatch.setenv("SUBMITIT_LOG_LEVEL", "NOCONFIG")  # or it would close pytest's own handlers
+    pytest.importorskip("submitit")
+    from vecpsmbpo.sweeps.on_submitit import Queue
+
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    jobs = ["7_0", "7_1", "7_2", "7_3"]
+    ended = []
+    for line in ("echo 7_0 RUNNING; echo 7_1 CANCELLED; echo 7_2 PENDING", "echo Invalid job id >&2; exit 1", "exit 1"):
+        program(tmp_path / "sacct", "echo Slurm accounting storage is disabled >&2; exit 1")
+        program(tmp_path / "squeue", line)
+        queue = Queue()
+        for job in jobs:
+            queue.register_job(job)
+        ended.append([job for job in jobs if queue.is_done(job)])
+    assert ended == [["7_1", "7_3"], jobs, []]  # who does not answer says nothing
+    program(tmp_path / "sacct", "echo 'JobID|State|NodeList'; echo '7_[0-2]|PENDING|a'; echo '7_3|CANCELLED by 0|a'")
+    assert [job for job in jobs if queue.is_done(job, mode="force")] == ["7_3"]
+    assert capfd.readouterr() == ("", "")
 
 
 def test_the_exit_status_is_the_worst_of_all(tmp_path, monkeypatch, capsys):

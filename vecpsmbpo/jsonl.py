@@ -93,7 +93,7 @@ class Growing:
             warn: is told of it.
         """
         self.path, self.written, self.mark = path, 0, (0, 0)
-        strange = self._rewind(env_steps, tuple(needed), mark[0] if mark else 0)
+        strange = self._rewind(env_steps, tuple(needed), mark[0] if mark else None)
         lost = max(0, mark[0] - self.mark[0] - strange) if mark else 0
         if strange:
             warn(f"{path}: {strange} line(s) that cannot be read, set aside in {self._aside.name}")
@@ -115,19 +115,24 @@ class Growing:
     def _aside(self) -> Path:
         return self.path.with_name(f"{self.path.name}.strange")
 
-    def _rewind(self, env_steps: int, needed: tuple[str, ...], written: int) -> int:
-        """How many lines are strange; so is one of the first `written` that is beyond `env_steps`."""
+    def _rewind(self, env_steps: int, needed: tuple[str, ...], written: int | None) -> int:
+        """How many lines are strange; so is one of the first `written` that is beyond `env_steps`.
+
+        Those of `env_steps` itself that came after the first `written` are of work that will be done again, too: of an
+        evaluation that was made up for.
+        """
         self.path.touch()
         beside, strange, before = self.path.with_suffix(".tmp"), [], 0
         with self.path.open("rb") as file, beside.open("wb") as rewound:
             for batch in batches(file, needed):
                 kept = []
                 for index, (text, line) in enumerate(batch, start=before):
-                    if line is None or (line[STEP] > env_steps and index < written):
+                    if line is None or (line[STEP] > env_steps and index < (written or 0)):
                         strange.append(text)
                         continue
                     self.written = max(self.written, line[STEP])
-                    if line[STEP] <= env_steps:
+                    again = line[STEP] == env_steps and written is not None and index >= written
+                    if line[STEP] <= env_steps and not again:
                         kept.append(text.rstrip(b"\r\n") + b"\n")
                 rewound.writelines(kept)
                 self._count(kept)

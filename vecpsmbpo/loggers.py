@@ -128,16 +128,27 @@ class Loggers:
 
 
 class TensorBoard:
-    """tensorboardX, which writes files only."""
+    """TensorBoard's files, by tensorboardX. Not by its `SummaryWriter`, whose thread ends where it cannot write: a run
+    would then wait for ever for room in its queue."""
 
     def __init__(self, run_dir: Path, env_steps: int):
-        from tensorboardX import SummaryWriter
+        from tensorboardX import event_file_writer, summary
+        from tensorboardX.proto import event_pb2
 
-        self._writer = SummaryWriter(str(run_dir / TENSORBOARD), purge_step=env_steps + 1)
+        self._event, self._scalar = event_pb2.Event, summary.scalar
+        folder = run_dir / TENSORBOARD
+        folder.mkdir(parents=True, exist_ok=True)
+        self._writer = event_file_writer.EventsWriter(str(folder / "events"))
+        # TensorBoard forgets what earlier sessions have written from here on.
+        begins = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
+        self._write(env_steps + 1, session_log=begins)
+
+    def _write(self, env_steps: int, **what: Any) -> None:
+        self._writer.write_event(self._event(step=env_steps, wall_time=time.time(), **what))
 
     def scalars(self, values: Values, env_steps: int) -> None:
         for name, value in values.items():
-            self._writer.add_scalar(name, value, env_steps)
+            self._write(env_steps, summary=self._scalar(name, value))
 
     def flush(self) -> None:
         self._writer.flush()

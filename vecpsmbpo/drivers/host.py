@@ -4,7 +4,7 @@ import itertools
 import zlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,13 @@ from vecpsmbpo.drivers.common import (
     evaluation_policies,
     split_for_episodes,
 )
-from vecpsmbpo.envs.host.batched import HostEnv, HostStep, SimulatorError
+from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
 from vecpsmbpo.layout import BY_SEED, SHARED
 from vecpsmbpo.schedule import begin_stride, observe_and_learn, over_seeds, split_keys
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
+
+T = TypeVar("T")
 
 
 class HostDriver:
@@ -132,7 +134,7 @@ class HostDriver:
     def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
         obs = state.env
         action, memory, key, keys = self._act(state.counters, state.seeds, obs)
-        step = _step_in_all(self._env, np.asarray(processes.here(action)))
+        step = _in_all(partial(self._env.step, np.asarray(processes.here(action))))
         seen = (step.reward, step.next_obs, step.terminated.astype(np.float32), step.truncated, step.obs)
         reward, next_obs, terminated, truncated, following = self.layout.everywhere(seen, BY_SEED)
         transition = Transition(obs, action, reward, next_obs, terminated)
@@ -147,7 +149,7 @@ class HostDriver:
         policies = self._policies(state.seeds, split.policy)
         env = self._make_env(num_envs=seeds * episodes, seed=env_seed)
         env.episode_length = self.settings.episode_length
-        obs = env.reset()
+        obs = _in_all(env.reset)
         compiled_for = self._compiled_evaluation_actions if episodes == self.settings.eval_episodes else None
         act, count = compiled_for or self._evaluation_actions, seeds * episodes
         memory = self.layout.everywhere(broadcast_leaves(self.algorithm.memory(), seeds, episodes), BY_SEED)
@@ -158,7 +160,7 @@ class HostDriver:
             states = self.layout.everywhere(obs.reshape(seeds, episodes, obs_size), BY_SEED)
             now = self.layout.everywhere(jnp.int32(t), SHARED)
             action, memory = act(policies, now, memory, states, split.actions)
-            step = _step_in_all(env, np.asarray(processes.here(action)).reshape(count, -1))
+            step = _in_all(partial(env.step, np.asarray(processes.here(action)).reshape(count, -1)))
             obs = step.obs
             total += np.where(alive & step.sound, step.reward, 0.0)
             length += alive
@@ -205,20 +207,20 @@ class HostDriver:
         return TrainState(counters, seeds, obs), end
 
 
-def _step_in_all(env: HostEnv, action: np.ndarray) -> HostStep:
-    """A step of the simulators, which fails in all processes of the run where it fails in one.
+def _in_all(call: Callable[[], T]) -> T:
+    """A call of the simulators, which fails in all processes of the run where it fails in one.
 
     Raises:
         SimulatorError: it has failed here, or in another one.
     """
     failed: SimulatorError | None = None
     try:
-        step = env.step(action)
+        result = call()
     except SimulatorError as error:
         failed = error
     if processes.greatest(int(failed is not None)):
         raise failed or SimulatorError("its simulator failed in another process of the run, which says how")
-    return step
+    return result
 
 
 def _stacked(news: list[EpisodeEnd]) -> Any:

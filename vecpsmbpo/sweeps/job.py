@@ -40,7 +40,13 @@ class Outcome:
 
 
 class Jobs(Protocol):
-    """The jobs of a grid, in a cluster."""
+    """The jobs of a grid, in a cluster.
+
+    Attributes:
+        at_signal: what is said to whoever tells this command to stop.
+    """
+
+    at_signal: str
 
     def look(self) -> list[Outcome | str]:
         """Of each how it ended, or, while it has not, what it is doing in a word."""
@@ -51,6 +57,9 @@ class Jobs(Protocol):
         Raises:
             Elsewhere: they are not this process's to end.
         """
+
+
+ASKING = "asking the jobs to save and to end; once more to leave at once"
 
 
 class Elsewhere(Exception):

@@ -9,7 +9,7 @@ import ray
 from vecpsmbpo import words
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.stopping import heeding_signals
-from vecpsmbpo.sweeps.job import Outcome, Run, train
+from vecpsmbpo.sweeps.job import ASKING, Outcome, Run, train
 
 
 class Preempted(Exception):
@@ -25,6 +25,8 @@ def _job(run: Run) -> Outcome:
 
 class Tasks:
     """A task for each run. What dies with its machine is begun again, and goes on from its checkpoint."""
+
+    at_signal = ASKING
 
     def __init__(self, runs: Sequence[Run], options: Mapping[str, Any]):
         """

@@ -2,18 +2,26 @@
 
 import os
 import signal
-from collections.abc import Mapping, Sequence
+import subprocess
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import submitit
+from submitit.slurm.slurm import SlurmInfoWatcher, SlurmJob
 
 from vecpsmbpo import crash
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.stopping import heeding_submitit
-from vecpsmbpo.sweeps.job import Elsewhere, Outcome, Run, train
+from vecpsmbpo.sweeps.job import ASKING, Elsewhere, Outcome, Run, train
 
 # Names that submitit has for every executor. What else `configs/hydra/launcher/submitit_slurm.yaml` lists is Slurm's.
 GENERIC = ("name", "timeout_min", "mem_gb", "cpus_per_task", "gpus_per_node", "stderr_to_stdout")
+
+
+# States of Slurm's from which a job does not come back by itself; one that nobody knows any more has ended, too.
+ENDED = ("boot_fail", "cancelled", "completed", "deadline", "failed", "node_fail", "out_of_memory", "timeout", "gone")
+ASK_AGAIN_S = 60  # at most; what a job has to say itself is seen at once
 
 
 class Job:
@@ -38,6 +46,8 @@ class Job:
 class Slurm:
     """One array of jobs."""
 
+    at_signal = "leaving the jobs to themselves"
+
     def __init__(self, runs: Sequence[Run], options: Mapping[str, Any]):
         """
         Raises:
@@ -50,6 +60,7 @@ class Slurm:
             executor.update_parameters(
                 **{name if name in GENERIC else f"slurm_{name}": value for name, value in given.items()}
             )
+            SlurmJob.watcher = Queue(delay_s=ASK_AGAIN_S)  # whom all jobs ask
             self._jobs = executor.submit_array([Job(run, slurm=True) for run in runs])
         except (RuntimeError, ValueError, TypeError, NameError) as error:
             said = str(error).strip().splitlines() or [type(error).__name__]
@@ -63,8 +74,43 @@ class Slurm:
         raise Elsewhere(f"the jobs go on without this command; scancel {' '.join(ids)} ends them")
 
 
+class Queue(SlurmInfoWatcher):
+    """What Slurm says of jobs: its accounting, or, where it keeps none, its queue. (submitit would print an error each
+    time then, and wait for ever for a job that has died.)"""
+
+    def is_done(self, job_id: str, mode: str = "standard") -> bool:
+        return _word(self.get_state(job_id, mode=mode)) in ENDED
+
+    def update(self) -> None:
+        awaited = self._registered - self._finished
+        numbers = ",".join(sorted({job.partition("_")[0] for job in awaited}))
+        if awaited:
+            told = _ask("sacct", "--format=JobID,State,NodeList", "--parsable2", f"--jobs={numbers}")
+            self._info_dict.update(self.read_info(told.stdout) if told.returncode == 0 else _queued(awaited, numbers))
+        self._last_status_check = time.time()
+        self._finished |= {job for job in awaited if self.is_done(job, mode="cache")}
+
+
+def _queued(jobs: Iterable[str], numbers: str) -> dict[str, dict[str, str]]:
+    """The states of jobs in the queue, which forgets them some minutes after their end."""
+    told = _ask("squeue", "--noheader", "--array", "--states=all", "--format=%i %T", f"--jobs={numbers}")
+    if told.returncode and "Invalid job id" not in told.stderr:
+        return {}  # nobody answers: nothing is known
+    states = dict(line.split(maxsplit=1) for line in told.stdout.splitlines())
+    return {job: {"State": states.get(job, "GONE")} for job in jobs}
+
+
+def _ask(*words: str) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(words, capture_output=True, text=True, check=False)
+    except OSError as error:
+        return subprocess.CompletedProcess(words, 1, "", str(error))
+
+
 class Local:
     """Processes of this machine, so many at a time."""
+
+    at_signal = ASKING
 
     def __init__(self, runs: Sequence[Run], options: Mapping[str, Any]):
         """
@@ -109,7 +155,7 @@ class Local:
 
 def _look(job: submitit.Job) -> Outcome | str:
     if not job.done():
-        return str(job.state).partition(" ")[0].lower()
+        return _word(job.state)
     try:
         return job.result()
     except submitit.core.utils.UncompletedJobError:  # killed, or crashed: it left its log, and no more
@@ -117,3 +163,8 @@ def _look(job: submitit.Job) -> Outcome | str:
         said = next((line for line in reversed(lines) if line.startswith("vecpsmbpo: ")), "vecpsmbpo: died")
         state = str(job.state).lower()
         return Outcome(1, f"{said.removeprefix('vecpsmbpo: ')} ({state}); its log is {job.paths.stderr}")
+
+
+def _word(state: str) -> str:
+    """`CANCELLED by 0`: cancelled."""
+    return str(state).partition(" ")[0].lower()

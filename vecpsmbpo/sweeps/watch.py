@@ -12,7 +12,7 @@ from rich.table import Table
 
 from vecpsmbpo import jsonl
 from vecpsmbpo.stopping import heeding_signals
-from vecpsmbpo.sweeps.job import Jobs, Outcome, Run
+from vecpsmbpo.sweeps.job import Elsewhere, Jobs, Outcome, Run
 
 LOOK_EVERY_S = 2.0
 PLAIN_LINE_EVERY_S = 30.0  # of one job, where there is no terminal
@@ -50,12 +50,11 @@ def follow(jobs: Jobs, runs: Sequence[Run], console: Console | None = None) -> l
         KeyboardInterrupt: a second signal; they have been asked a second time to stop, too.
     """
     view = _View(runs, console or Console(highlight=False, soft_wrap=True))
-    with heeding_signals("asking the jobs to save and to end; once more to leave at once") as stop:
-        asked = False
+    with heeding_signals(jobs.at_signal) as stop:
+        asked, seen = False, jobs.look()
         try:
             with view.live:
                 while True:
-                    seen = jobs.look()
                     view.show(seen)
                     outcomes = [outcome for outcome in seen if isinstance(outcome, Outcome)]
                     if len(outcomes) == len(seen):
@@ -64,6 +63,10 @@ def follow(jobs: Jobs, runs: Sequence[Run], console: Console | None = None) -> l
                         asked = True
                         jobs.stop()
                     time.sleep(LOOK_EVERY_S)
+                    seen = jobs.look()
+        except Elsewhere:
+            view.end(seen)
+            raise
         except KeyboardInterrupt:
             jobs.stop()
             raise
@@ -98,8 +101,8 @@ class _View:
                     self._console.print(" ".join(["job", *self._row(index, job)]), markup=False)
         self._seen = list(seen)
 
-    def end(self, outcomes: Sequence[Outcome]) -> None:
-        self._console.print(self._table(outcomes))
+    def end(self, seen: Sequence[Outcome | str]) -> None:
+        self._console.print(self._table(seen))
 
     def _table(self, seen: Sequence[Outcome | str]) -> Table:
         table = Table("job", box=None)

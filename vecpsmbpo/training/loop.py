@@ -104,6 +104,8 @@ class _Session:
         if saved:
             driver.load_env(saved.host["env"])
         self.env_steps = saved.step if saved else 0
+        # Whether the epoch that ends here has not been evaluated yet: a simulator failed in that.
+        self.to_evaluate = bool(saved and saved.host.get("to_evaluate"))
         self.health = processes.here(self.state.seeds.health)
         self.frozen = np.asarray(health.frozen(self.health))
         self.log: metrics.RunLog | metrics.NoLog = metrics.NoLog()
@@ -125,7 +127,7 @@ class _Session:
         try:
             with self.display:
                 self._introduce()
-                if self.env_steps >= settings.total_steps:
+                if self.env_steps >= settings.total_steps and not self.to_evaluate:
                     self.display.say(f"already complete at {self.env_steps} steps; raise total_steps to go on")
                     return self._status
                 if self.frozen.all():
@@ -137,6 +139,8 @@ class _Session:
                 if self.saved_step is None:
                     self._save()
                 self._compile()
+                if self.to_evaluate:
+                    self._end_epoch()
                 while self.env_steps < settings.total_steps and not self.frozen.all() and not self._asked_to(stop):
                     self._chunk()
                 self._save()
@@ -226,7 +230,13 @@ class _Session:
         settings = self.settings
         seconds = time.perf_counter() - self.epoch_began
         keys = evaluation_keys(settings, self.env_steps)
-        returns = self.driver.evaluate(self.state, keys, settings.eval_episodes)
+        try:
+            returns = self.driver.evaluate(self.state, keys, settings.eval_episodes)
+        except SimulatorError:
+            self.to_evaluate = True
+            self._save()
+            raise
+        self.to_evaluate = False
         lines = [line for line, frozen in zip(self._lines(returns, seconds), self.frozen, strict=True) if not frozen]
         self.log.metrics(lines)
         self.display.epoch(self.env_steps, float(np.mean([line["eval_return"] for line in lines])))
@@ -311,7 +321,12 @@ class _Session:
     def _save(self) -> None:
         if self.saved_step != self.env_steps:
             self._check_disk(self.env_steps)
-            host = {"env": self.driver.save_env(), "seconds": self.watch(), "logs": self.log.marks}
+            host = {
+                "env": self.driver.save_env(),
+                "seconds": self.watch(),
+                "logs": self.log.marks,
+                "to_evaluate": self.to_evaluate,
+            }
             self.checkpoints.save(self.env_steps, self.state, host, self.driver.layout)
             self.saved_step = self.env_steps
 
