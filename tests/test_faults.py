@@ -1,10 +1,12 @@
 """What careless commands, surroundings and tasks do: one line each. In this process, where nothing has to start."""
 
 import contextlib
+import errno
 import io
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +17,7 @@ import pytest
 from rich.console import Console
 
 from tests.helpers import command, environment, tiny
+from tools import faults
 from vecpsmbpo import cli, config, envs, runtime, stopping, words
 from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
 from vecpsmbpo.settings import SettingError
@@ -230,3 +233,56 @@ def test_a_reader_that_is_gone_does_not_stop_what_is_printed_to_it(monkeypatch):
         assert unheard
         with contextlib.suppress(BrokenPipeError):  # what is left in its buffer
             pipe.close()
+
+
+WRITING = """
+import os, sys
+for act in (
+    lambda: os.mkdir("below/a"),
+    lambda: open("below/a/b", "wb", buffering=0).write(b"x"),
+    lambda: os.fsync(os.open("below/a/b", os.O_WRONLY)),
+    lambda: os.rename("below/a/b", "below/a/c"),
+    lambda: open("below/a/c").read() + open("beside", "w").name,
+):
+    try:
+        act()
+    except OSError as error:
+        print(error.errno)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux" or shutil.which("gcc") is None, reason="needs gcc and LD_PRELOAD")
+def test_one_write_below_a_directory_can_be_made_to_fail(tmp_path):
+    """What tools/faults makes of writes.c."""
+    shim = tmp_path / "writes.so"
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", shim, faults.SHIM, "-ldl"], check=True)
+    told = {"LD_PRELOAD": str(shim), "WRITES_BELOW": str(tmp_path / "below"), "WRITES_LOG": str(tmp_path / "log")}
+    seen = ["mkdir a", "open a/b", "write a/b", "open a/b", "sync a/b", "rename a/c"]
+    for number in range(len(seen) + 1):
+        shutil.rmtree(tmp_path / "below", ignore_errors=True)
+        (tmp_path / "below").mkdir()
+        (tmp_path / "log").unlink(missing_ok=True)
+        surroundings = {**environment(), **told, "WRITES_FAIL": str(number), "WRITES_ERROR": str(errno.EIO)}
+        program = [os.path.realpath(sys.executable), "-c", WRITING]
+        result = subprocess.run(program, cwd=tmp_path, env=surroundings, capture_output=True, text=True, check=True)
+        errors = result.stdout.split()
+        assert errors[:1] == ([str(errno.EIO)] if number else [])
+        lines = (tmp_path / "log").read_text().splitlines()
+        assert lines[:number] == seen[:number]
+        assert number or lines == seen
+
+
+def test_each_kind_of_write_is_tried():
+    array = "checkpoints/120.orbax-checkpoint-tmp/state.orbax-checkpoint-tmp/real.0"
+    kinds = [faults._kind_of_write(f"write {array}/{name}") for name in ("0.0", "0.0.__lock", "1.0", ".zarray")]
+    assert kinds == [f"write checkpoints/state/array/{name}" for name in ("part", "part__lock", "part", ".zarray")]
+    assert faults._kind_of_write("open .config.4711.yaml") == "open .config.#.yaml"
+    chosen = faults._chosen(["a"] * 5 + ["b"], more=1)
+    assert [what for what, _ in chosen.values()][:4] == [
+        "a, first of 5",
+        "b, first of 1",
+        "a, middle of 5",
+        "a, last of 5",
+    ]
+    assert len(chosen) == 5
+    assert {error for _, error in chosen.values()} == {errno.ENOSPC, errno.EIO}

@@ -10,6 +10,10 @@ state with log lines that are lost and said to be, one line that says what is wr
     files       each file of a run directory truncated, emptied, replaced by noise, one bit flipped; then gone on with
     signals     SIGINT, SIGTERM, SIGHUP, and kill -9 ten seconds later; then gone on with
     twice       a second process in the directory of a run
+    writes      each kind of write (opening, writing, syncing, renaming, making a directory) to each kind of file of a
+                run directory failing once, of a full disk or an I/O error: the first, the middle and the last one, and
+                writes=20 drawn from all others; then gone on with. Needs gcc. portion=2/4 tries the second quarter of
+                these, and keeps the rows of the others
     disk        disks of many sizes and numbers of files, which fill up in one write or another; then made larger, and
                 gone on with (mounts them, so needs root)
     kills       kill -9 at random moments, one of five while a checkpoint is written, until the run is complete
@@ -19,6 +23,7 @@ state with log lines that are lost and said to be, one line that says what is wr
 
 import contextlib
 import csv
+import errno
 import io
 import json
 import random
@@ -30,9 +35,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -42,6 +48,7 @@ from vecpsmbpo import arguments, checkpoint, cli, jsonl
 from vecpsmbpo.settings import SettingError
 
 OUT = Path("results/faults.csv")
+SHIM = Path(__file__).with_name("writes.c")
 RUN = ["size=tiny", "env=ball_in_cup", "loggers=[]"]  # 40 steps an epoch, a checkpoint each
 STOPPED, END = 120, 160
 TO_LIVE_S = 10.0
@@ -119,11 +126,18 @@ def command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess:
     return subprocess.CompletedProcess(arguments, process.returncode, said, errors)
 
 
-def started(*arguments: str, cwd: Path, limit: tuple[int, int] | None = None) -> subprocess.Popen:
+def started(
+    *arguments: str,
+    cwd: Path,
+    limit: tuple[int, int] | None = None,
+    one_thread: bool = True,
+    surroundings: Mapping[str, str] = MappingProxyType({}),
+) -> subprocess.Popen:
     """`limit`: a resource, and how much of it the process may have."""
-    pipe, train = subprocess.PIPE, argv("train", *arguments, one_thread=True)
+    pipe, train = subprocess.PIPE, argv("train", *arguments, one_thread=one_thread)
     obey = partial(resource.setrlimit, limit[0], (limit[1],) * 2) if limit else None
-    return subprocess.Popen(train, cwd=cwd, env=environment(), stdout=pipe, stderr=pipe, text=True, preexec_fn=obey)
+    surrounded = {**environment(), **surroundings}
+    return subprocess.Popen(train, cwd=cwd, env=surrounded, stdout=pipe, stderr=pipe, text=True, preexec_fn=obey)
 
 
 def said_until(process: subprocess.Popen, word: str) -> None:
@@ -242,6 +256,77 @@ def twice(folder: Path, options: dict) -> Iterator[Found]:
     yield "the first process", same_end(folder / "run", undisturbed(folder, "host"))
 
 
+def writes(folder: Path, options: dict) -> Iterator[Found]:
+    if shutil.which("gcc") is None:
+        print("writes: not tried: there is no gcc here")
+        return
+    shim = folder / "writes.so"
+    subprocess.run(["gcc", "-shared", "-fPIC", "-O2", "-o", shim, SHIM, "-ldl"], check=True)
+    # With a logger, which writes, too; and on all cores, as the runs of this process that go on.
+    run = [*RUN[:-1], "loggers=[tensorboard]", "backend=host", f"total_steps={END}"]
+
+    def begun(run_dir: Path, **told: object) -> tuple[int, str]:
+        surroundings = {"LD_PRELOAD": str(shim), "WRITES_BELOW": str(run_dir), "WRITES_LOG": f"{run_dir}.log"}
+        surroundings |= {f"WRITES_{name.upper()}": str(value) for name, value in told.items()}
+        process = started(*run, f"run_dir={run_dir}", cwd=folder, one_thread=False, surroundings=surroundings)
+        try:
+            errors = process.communicate(timeout=ANSWER_S)[1]
+        except subprocess.TimeoutExpired:
+            process.kill()
+            errors = process.communicate()[1] + "has not ended"
+        return process.returncode, errors
+
+    reference = folder / "reference"
+    status, errors = begun(reference)
+    assert (status, errors) == (0, ""), errors
+    seen = Path(f"{reference}.log").read_text().splitlines()
+    chosen = _chosen([_kind_of_write(line) for line in seen], options["writes"])
+    which, of = map(int, options["portion"].split("/"))
+    print(f"writes: {len(seen)} of an undisturbed run, {len(chosen)} of them tried", flush=True)
+    for number, (what, error) in list(chosen.items())[len(chosen) * (which - 1) // of : len(chosen) * which // of]:
+        run_dir = folder / "disturbed"
+        status, errors = begun(run_dir, fail=number, error=error)
+        if status == 0:
+            others = [line for line in errors.splitlines() if not line.startswith("vecpsmbpo: warning: ")]
+            ended = same_end(run_dir, reference) if not others else f"status 0, and besides {' '.join(others)[-200:]!r}"
+        else:
+            ended = one_line(status, errors)
+            if ended == ONE_LINE:
+                status, errors = here([*run, f"run_dir={run_dir}"])
+                ended = same_end(run_dir, reference) if status == 0 else f"not gone on with: {errors[-200:]!r}"
+        shutil.rmtree(run_dir, ignore_errors=True)
+        yield f"{what} fails with {errno.errorcode[error]}", ended
+
+
+def _kind_of_write(line: str) -> str:
+    """Of `write checkpoints/120.orbax-checkpoint-tmp/state/real.0/0.0`: `write checkpoints/state/array/part`. Other
+    numbers are processes and times."""
+    what, path = line.split(maxsplit=1)
+    parts = [part.partition(".orbax-checkpoint-tmp")[0] for part in Path(path).parts]
+    inside = parts.index("state") + 1 if "state" in parts else len(parts)
+    if len(parts) > inside and not parts[inside].startswith(("_", "commit", "manifest")):
+        parts[inside:] = ["array", *(re.sub(r"^\d[\d.]*", "part", name) for name in parts[inside + 1 :])]
+    kind = "/".join(part for part in parts if not part.isdigit())
+    return f"{what} {re.sub(r'[0-9]+', '#', kind) or '.'}"
+
+
+def _chosen(kinds: list[str], more: int) -> dict[int, tuple[str, int]]:
+    """By number, from 1: what a write is called in the table, and the error that it fails with; they alternate."""
+    found: dict[int, str] = {}
+    numbers: dict[str, list[int]] = {}
+    for number, kind in enumerate(kinds, start=1):
+        numbers.setdefault(kind, []).append(number)
+    for name in ("first", "middle", "last"):  # of all kinds: a part that is stopped has tried each
+        for kind, own in numbers.items():
+            number = own[{"first": 0, "middle": len(own) // 2, "last": -1}[name]]
+            found.setdefault(number, f"{kind}, {name} of {len(own)}")
+    rest = [number for number in range(1, len(kinds) + 1) if number not in found]
+    for number in sorted(random.Random(0).sample(rest, min(more, len(rest)))):
+        found[number] = f"{kinds[number - 1]}, write {number} of all"
+    errors = (errno.ENOSPC, errno.EIO)
+    return {number: (what, errors[index % 2]) for index, (number, what) in enumerate(found.items())}
+
+
 def disk(folder: Path, options: dict) -> Iterator[Found]:
     reference, small = undisturbed(folder, "host"), folder / "disk"
     small.mkdir()
@@ -328,12 +413,21 @@ def limits(folder: Path, options: dict) -> Iterator[Found]:
         yield what, ended
 
 
-PARTS = {part.__name__: part for part in (careless, files, signals, twice, disk, kills, limits)}
+PARTS = {part.__name__: part for part in (careless, files, signals, twice, writes, disk, kills, limits)}
+
+
+def _portion(text: str) -> str:
+    which, of = map(int, text.split("/"))
+    if not 1 <= which <= of:
+        raise ValueError
+    return text
 
 
 OPTIONS = {
     "part": arguments.names("which to try", *PARTS, allowed=f"of {', '.join(PARTS)}, separated by commas"),
     "kills": arguments.whole("of each driver", 100, at_least=1),
+    "writes": arguments.whole("drawn from those that are no kind's first, middle or last", 20),
+    "portion": arguments.Option("of the writes that are tried", "1/1", _portion, "which/of, such as 2/4"),
 }
 
 
@@ -348,16 +442,20 @@ def main(words: Sequence[str]) -> int:
             for what, ended in PARTS[name](Path(folder).resolve(), options):
                 print(f"{name}: {what}: {ended}", flush=True)
                 rows.append({"part": name, "what": what, "ended": ended})
-                keep(name, rows)  # at once: a part that is stopped has told what it found
+                keep(
+                    name, rows, among=name == "writes" and options["portion"] != "1/1"
+                )  # at once: a part that is stopped has told what it found
         bad += sum(row["ended"] not in FINE for row in rows)
         print(f"{name}: {len(rows)} tried, {sum(row['ended'] not in FINE for row in rows)} faults", flush=True)
     return int(bad > 0)
 
 
-def keep(part: str, rows: list[dict]) -> None:
-    """Puts the rows in the place of those that the table had of this part."""
+def keep(part: str, rows: list[dict], among: bool) -> None:
+    """Puts the rows in the place of those that the table had of this part; `among` them, of those of the same name."""
     others = list(csv.DictReader(OUT.open())) if OUT.exists() else []
-    rows = [row for row in others if row["part"] in PARTS.keys() - {part}] + rows
+    names = {row["what"] for row in rows}
+    kept = [row for row in others if row["part"] != part or (among and row["what"] not in names)]
+    rows = [row for row in kept if row["part"] in PARTS] + rows
     with OUT.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["part", "what", "ended"], lineterminator="\n")
         writer.writeheader()
