@@ -13,8 +13,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from vecpsmbpo import versions
-
 ADVICE = "try devices=1, compile_cache=false, or another Python (which brings another jax)"
 BESIDE_OTHERS = " beside other processes"
 ADVICE_TO_SEVERAL = "another process of the run may have gone; to go on, give the same command again, in all of them"
@@ -102,6 +100,8 @@ def obituary(story: str) -> str | None:
     Args:
         story: all that came through the pipe.
     """
+    from vecpsmbpo import versions  # which every start would wait for otherwise
+
     told, fatal, stack = story.partition(_FATAL)
     lines = told.splitlines()
     if not lines or lines[-1] == _END:
