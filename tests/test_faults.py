@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from tests.helpers import command, environment, tiny
-from tools import faults
+from tools.harm import writes
 from vecpsmbpo import cli, config, envs, runtime, stopping, words
 from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
 from vecpsmbpo.settings import SettingError
@@ -255,7 +255,7 @@ for act in (
 def test_one_write_below_a_directory_can_be_made_to_fail(tmp_path):
     """What tools/faults makes of writes.c."""
     shim = tmp_path / "writes.so"
-    subprocess.run(["gcc", "-shared", "-fPIC", "-o", shim, faults.SHIM, "-ldl"], check=True)
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", shim, writes.SHIM, "-ldl"], check=True)
     told = {"LD_PRELOAD": str(shim), "WRITES_BELOW": str(tmp_path / "below"), "WRITES_LOG": str(tmp_path / "log")}
     seen = ["mkdir a", "open a/b", "write a/b", "open a/b", "sync a/b", "rename a/c"]
     for number in range(len(seen) + 1):
@@ -274,10 +274,10 @@ def test_one_write_below_a_directory_can_be_made_to_fail(tmp_path):
 
 def test_each_kind_of_write_is_tried():
     array = "checkpoints/120.orbax-checkpoint-tmp/state.orbax-checkpoint-tmp/real.0"
-    kinds = [faults._kind_of_write(f"write {array}/{name}") for name in ("0.0", "0.0.__lock", "1.0", ".zarray")]
+    kinds = [writes._kind_of_write(f"write {array}/{name}") for name in ("0.0", "0.0.__lock", "1.0", ".zarray")]
     assert kinds == [f"write checkpoints/state/array/{name}" for name in ("part", "part__lock", "part", ".zarray")]
-    assert faults._kind_of_write("open .config.4711.yaml") == "open .config.#.yaml"
-    chosen = faults._chosen(["a"] * 5 + ["b"], more=1)
+    assert writes._kind_of_write("open .config.4711.yaml") == "open .config.#.yaml"
+    chosen = writes._chosen(["a"] * 5 + ["b"], more=1)
     assert [what for what, _ in chosen.values()][:4] == [
         "a, first of 5",
         "b, first of 1",
