@@ -12,11 +12,11 @@ import jax
 import numpy as np
 
 from tests import devices
-from vecpsmbpo import algorithms, config, evaluate, metrics, placement
+from vecpsmbpo import config, evaluate, metrics, placement
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.envs.host.batched import HostEnv
+from vecpsmbpo.programs import initial_inputs, make_algorithm
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.training.programs import initial_inputs
 from vecpsmbpo.types import EnvSpec, SeedState
 
 METRICS = {
@@ -35,7 +35,7 @@ def tiny(**changes: Any) -> Settings:
 
 
 def algorithm(settings: Settings, spec: EnvSpec) -> Any:
-    return algorithms.make(settings, spec)
+    return make_algorithm(settings, spec)
 
 
 def initial(algorithm: Algorithm) -> SeedState:

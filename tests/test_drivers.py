@@ -14,7 +14,7 @@ from vecpsmbpo import metrics, placement, replay, sac
 from vecpsmbpo.algorithms.catalogue import of_algorithm
 from vecpsmbpo.drivers import HostDriver, ScanDriver
 from vecpsmbpo.drivers.common import split_for_episodes
-from vecpsmbpo.training.programs import evaluation_keys, initial_inputs
+from vecpsmbpo.programs import evaluation_keys, initial_inputs
 
 DISCOUNT = 0.5
 STEPS = 1000  # after 600, Q is still 0.14 below its limit (mean over ten seeds), after these 0.06

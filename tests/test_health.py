@@ -17,10 +17,9 @@ import pytest
 
 from tests import probes
 from tests.helpers import algorithm, argv, initial, tiny, without_times
-from vecpsmbpo import checkpoint, evaluate, health, jsonl, placement, replay, training
+from vecpsmbpo import checkpoint, evaluate, health, jsonl, placement, programs, replay, training
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.training import programs
 from vecpsmbpo.types import Counters, TrainState
 
 MAKE = {"mjx": "tests.probes:FailingProbe", "host": "tests.probes:FailingGymnasium"}

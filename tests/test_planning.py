@@ -13,8 +13,8 @@ from tests.test_drivers import make_driver
 from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics
 from vecpsmbpo.algorithms.pets import planning
+from vecpsmbpo.programs import evaluation_keys, initial_inputs
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.training.programs import evaluation_keys, initial_inputs
 from vecpsmbpo.types import EnvSpec, Hyper
 
 LIMIT = 3.5

@@ -13,8 +13,8 @@ from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, replay
 from vecpsmbpo.algorithms.slbo import multistep, networks, trpo
 from vecpsmbpo.envs import specs
+from vecpsmbpo.programs import evaluation_keys, initial_inputs
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.training.programs import evaluation_keys, initial_inputs
 from vecpsmbpo.types import EnvSpec, Hyper, Transition
 
 SPEC = specs.get("ball_in_cup")

@@ -15,7 +15,7 @@ from tests.test_drivers import make_driver, settings_for
 from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, posterior, sac
 from vecpsmbpo.envs import specs
-from vecpsmbpo.training.programs import initial_inputs
+from vecpsmbpo.programs import initial_inputs
 from vecpsmbpo.types import Counters, Hyper
 
 # ── forced exploration (equation 33) ─────────────────────────────────────────────────────────────────────────────

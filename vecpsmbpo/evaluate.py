@@ -13,8 +13,8 @@ from rich.table import Table
 
 from vecpsmbpo import checkpoint, crash, resources, runtime
 from vecpsmbpo.drivers import Driver, Returns
+from vecpsmbpo.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.types import TrainState
 
 

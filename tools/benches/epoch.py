@@ -13,8 +13,8 @@ from tools.benches.simulators import mjx_steps
 from tools.benches.timing import best_seconds
 from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.layout import SEEDS
+from vecpsmbpo.programs import initial_inputs
 from vecpsmbpo.schedule import over_seeds
-from vecpsmbpo.training.programs import initial_inputs
 from vecpsmbpo.types import TrainState
 
 WORLD_STRIDES = 4

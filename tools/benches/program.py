@@ -11,9 +11,9 @@ import numpy as np
 from tools.benches.timing import best_seconds, matmul_peak
 from vecpsmbpo import config, runtime
 from vecpsmbpo.drivers import ScanDriver
+from vecpsmbpo.programs import initial_inputs, make_driver
 from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.training.programs import initial_inputs, make_driver
 from vecpsmbpo.types import TrainState
 
 PAPER = [

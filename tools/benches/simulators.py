@@ -13,7 +13,7 @@ import numpy as np
 from tools.benches.timing import best_seconds
 from vecpsmbpo import config, envs, runtime
 from vecpsmbpo.envs import registry
-from vecpsmbpo.training.programs import initial_inputs, make_driver
+from vecpsmbpo.programs import initial_inputs, make_driver
 
 
 def bench_envs() -> list[dict[str, Any]]:

@@ -1,19 +1,14 @@
 """The algorithms by name: a folder each, with its own settings, over the functions of `base.Algorithm`.
 
-Knows their settings; what learns, and JAX with it, is imported when it is to be made.
+Knows their settings; what learns, and JAX with it, is imported when it is to be made (`programs`).
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 from vecpsmbpo.algorithms.pets.settings import PetsSettings
 from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings, RealDataSettings
 from vecpsmbpo.algorithms.slbo.settings import SlboSettings
 from vecpsmbpo.settings import Settings
-
-if TYPE_CHECKING:
-    from vecpsmbpo.algorithms.base import Algorithm
-    from vecpsmbpo.types import EnvSpec
 
 
 class Entry(NamedTuple):
@@ -43,12 +38,3 @@ TABLE = {
     "pets": Entry("PETS", PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=4),
     "sac": _PS_MBPO._replace(title="SAC", settings=RealDataSettings),
 }
-
-
-def make(settings: Settings, spec: "EnvSpec") -> "Algorithm":
-    """The algorithm that `algo=` names, on this process's devices."""
-    from vecpsmbpo.layout import Layout
-
-    module, _, name = TABLE[settings.algo].place.partition(":")
-    chosen: Any = getattr(import_module(module), name)
-    return chosen(settings, spec, Layout.of(settings))

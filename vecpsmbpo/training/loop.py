@@ -27,11 +27,11 @@ from vecpsmbpo import (
 from vecpsmbpo.drivers import Driver, Interrupted, Returns
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.look import report
+from vecpsmbpo.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.stopping import Stop, heeding_signals
 from vecpsmbpo.training.guards import alone_in, disk_errors, memory_errors
-from vecpsmbpo.training.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
 # An epoch that takes longer than this is run in chunks of about half of it, to show progress and to heed signals.

@@ -2,14 +2,18 @@
 
 import dataclasses
 from functools import partial
+from importlib import import_module
 
 import jax
 import jax.numpy as jnp
 
-from vecpsmbpo import algorithms, envs
+from vecpsmbpo import envs
+from vecpsmbpo.algorithms import TABLE
+from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers import Driver, HostDriver, ScanDriver
+from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import Hyper
+from vecpsmbpo.types import EnvSpec, Hyper
 
 
 def make_driver(settings: Settings) -> Driver:
@@ -22,8 +26,15 @@ def make_driver(settings: Settings) -> Driver:
     env = make_env(num_envs=len(settings.lanes), seed=settings.seed)
     if not settings.episode_length:
         settings = dataclasses.replace(settings, episode_length=env.spec.episode_length)
-    algorithm = algorithms.make(settings, env.spec)
+    algorithm = make_algorithm(settings, env.spec)
     return ScanDriver(algorithm, env) if settings.backend == "mjx" else HostDriver(algorithm, env, make_env)
+
+
+def make_algorithm(settings: Settings, spec: EnvSpec) -> Algorithm:
+    """The algorithm that `algo=` names, on this process's devices."""
+    module, _, name = TABLE[settings.algo].place.partition(":")
+    chosen: type[Algorithm] = getattr(import_module(module), name)
+    return chosen(settings, spec, Layout.of(settings))
 
 
 def initial_inputs(settings: Settings) -> tuple[jax.Array, Hyper]:
