@@ -38,7 +38,8 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
 {groups}
 settings: {settings}
 
-What each setting does stands beside its default in {config}.
+What each setting does stands beside its default in {config};
+of those that PETS or SLBO alone has, in algo/settings beside it.
 """
 
 

@@ -1,4 +1,5 @@
-"""The one place where single models, agents and seeds become batches, and where batches lie on devices.
+"""Where seeds, models and members lie on devices, and how devices talk. (What goes from there to the host and back:
+`placement`.)
 
 The devices form a mesh of two axes, `seeds` × `members`. Seeds never talk to one another. Members of a seed are
 spread over the second axis, rounded up to it; the real data, the environment and the posterior are replicated along

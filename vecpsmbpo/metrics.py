@@ -135,7 +135,7 @@ def epoch_lines(state: TrainState, algorithm: Algorithm) -> list[Line]:
     Null: there was nothing yet.
 
     Args:
-        state: without padding (`Layout.unpad`); its rings are not looked at.
+        state: without padding (`placement.unpad`); its rings are not looked at.
     """
     settings, seeds = algorithm.settings, state.seeds
     stats = {name: np.asarray(value) for name, value in vars(seeds.agents.stats).items()}

@@ -98,7 +98,9 @@ class Algorithm(ABC):
         """[N·M] what each member promises, where `weights=values`, or None."""
         return None
 
-    def draw(self, members: Posterior, values: Any, hyper: Hyper, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def draw(
+        self, members: Posterior, values: jax.Array | None, hyper: Hyper, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """Who acts in the episode that begins, [] int, and the distribution [N·M] that it was drawn from."""
         return jnp.int32(0), jnp.ones(self.settings.n_members)
 
@@ -237,7 +239,16 @@ class Algorithm(ABC):
     def _unpack(self, rows: jax.Array) -> Transition:
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
 
-    def _begin_episode(self, members, values, hyper: Hyper, index, warmups, random, key: jax.Array) -> Episode:
+    def _begin_episode(
+        self,
+        members: Posterior,
+        values: jax.Array | None,
+        hyper: Hyper,
+        index: jax.Array,
+        warmups: jax.Array,
+        random: jax.Array,
+        key: jax.Array,
+    ) -> Episode:
         member, probs = self.draw(members, values, hyper, key)
         after_warmup = jnp.maximum(index - warmups, 1)
         explores = posterior.exploration_probability(hyper.forced_exploration, after_warmup)
@@ -245,7 +256,7 @@ class Algorithm(ABC):
         zero = jnp.zeros(())
         return Episode(index, warmups, member, random, probs, values, episode_return=zero, length=jnp.int32(0))
 
-    # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
+    # ── where a stride begins ────────────────────────────────────────────────────────────────────────────────
 
     def begin_epoch(self, counters: Counters, state: SeedState) -> SeedState:
         """Clears the epoch's sums when an epoch begins."""

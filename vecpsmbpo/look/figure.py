@@ -1,6 +1,7 @@
 """`vecpsmbpo figure`: a figure of the paper, or its table, from the runs of its experiment."""
 
 import functools
+import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -297,7 +298,11 @@ def draw_states(experiment: Experiment) -> "Figure":
 def table_1(experiment: Experiment) -> str:
     """Table 1 as Markdown: the hyperparameters that the runs had, and what both methods reached with them."""
     tasks = [(task, here[0].lanes[0].run.settings) for task, here in experiment.tasks()]
-    optimistic = {run.settings.env: run.settings for run in experiment.runs if run.settings.algo == "ops_mbpo"}
+    optimistic = {
+        run.settings.env: run.settings
+        for run in experiment.runs
+        if not math.isinf(getattr(run.settings, "temperature", math.inf))
+    }
     lines = [["", *(task for task, _ in tasks)], ["---", *["---:"] * len(tasks)]]
     for name in TABLE_1:
         # τ is OPS-MBPO's; PS-MBPO's is infinite.

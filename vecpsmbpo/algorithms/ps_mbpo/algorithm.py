@@ -75,7 +75,9 @@ class PsMbpo(Algorithm):
 
     # ── who acts: once an episode ────────────────────────────────────────────────────────────────────────────
 
-    def draw(self, members: Posterior, values: Any, hyper: Hyper, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def draw(
+        self, members: Posterior, values: jax.Array | None, hyper: Hyper, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """A member by equation 18 or 19; with `posterior=average` none, -1."""
         member, probs = posterior.draw(posterior.logits(members, values, hyper.temperature), key)
         return jnp.int32(-1) if self.settings.averages_members else member, probs

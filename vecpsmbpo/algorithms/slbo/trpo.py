@@ -19,6 +19,8 @@ CG_ITERATIONS = 10
 LINE_SEARCH_STEPS = 10  # each half as long as the one before
 VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 20, 256, 1e-3  # of Adam, after each step of the policy
 
+Rows = tuple[Float[Array, "K O"], Float[Array, "K A"], Float[Array, " K"]]  # observations, actions, advantages
+
 
 class TrpoStats(Stats):
     """What an update reports."""
@@ -93,9 +95,9 @@ def advantages(
 
 
 def surrogate(
-    policy: Params, old_log_prob: Float[Array, " K"], rows: Any, entropy_weight: float, *, nets: Networks
+    policy: Params, old_log_prob: Float[Array, " K"], rows: Rows, entropy_weight: float, *, nets: Networks
 ) -> Float[Array, ""]:
-    """E[π / π_old · advantage] and the entropy bonus. rows: (obs [K, O], action [K, A], advantage [K])."""
+    """E[π / π_old · advantage] and the entropy bonus."""
     obs, action, advantage = rows
     distribution = nets.policy.distribution(policy, obs)
     ratio = jnp.exp(distribution.log_prob(action) - old_log_prob)
@@ -124,13 +126,10 @@ def natural_direction(
 
 
 def policy_step(
-    policy: Params, rows: Any, *, trust_region: float, entropy_weight: float, nets: Networks
+    policy: Params, rows: Rows, *, trust_region: float, entropy_weight: float, nets: Networks
 ) -> tuple[Params, Float[Array, ""]]:
     """The policy after one step that improves the surrogate and stays within the trust region, or the same policy where
     no step of the line search does; and by how much the surrogate grew.
-
-    Args:
-        rows: obs [K, O], action [K, A], advantage [K].
     """
     flat, unravel = ravel_pytree(policy)
     old_log_prob = nets.policy.distribution(policy, rows[0]).log_prob(rows[1])
