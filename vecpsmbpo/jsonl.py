@@ -84,16 +84,27 @@ class Growing:
         mark: lines and checksum of all that it holds, which the next checkpoint keeps.
     """
 
-    def __init__(self, path: Path, env_steps: int, needed: Iterable[str], mark: Sequence[int] | None, warn: Callable):
+    def __init__(
+        self,
+        path: Path,
+        env_steps: int,
+        needed: Iterable[str],
+        mark: Sequence[int] | None,
+        warn: Callable,
+        *,
+        unfinished: bool = False,
+    ):
         """Drops lines beyond `env_steps`, and sets strange ones aside in a file beside it.
 
         Args:
             needed: numbers that a line has.
             mark: of the file when the checkpoint was made, to find what has been lost or changed since.
             warn: is told of it.
+            unfinished: whether lines of `env_steps` itself were still to be written then: those after the mark are
+                dropped, too.
         """
         self.path, self.written, self.mark = path, 0, (0, 0)
-        strange = self._rewind(env_steps, tuple(needed), mark[0] if mark else None)
+        strange = self._rewind(env_steps, tuple(needed), mark[0] if mark else 0, unfinished)
         lost = max(0, mark[0] - self.mark[0] - strange) if mark else 0
         if strange:
             warn(f"{path}: {strange} line(s) that cannot be read, set aside in {self._aside.name}")
@@ -115,23 +126,19 @@ class Growing:
     def _aside(self) -> Path:
         return self.path.with_name(f"{self.path.name}.strange")
 
-    def _rewind(self, env_steps: int, needed: tuple[str, ...], written: int | None) -> int:
-        """How many lines are strange; so is one of the first `written` that is beyond `env_steps`.
-
-        Those of `env_steps` itself that came after the first `written` are of work that will be done again, too: of an
-        evaluation that was made up for.
-        """
+    def _rewind(self, env_steps: int, needed: tuple[str, ...], written: int, unfinished: bool) -> int:
+        """How many lines are strange; so is one of the first `written` that is beyond `env_steps`."""
         self.path.touch()
         beside, strange, before = self.path.with_suffix(".tmp"), [], 0
         with self.path.open("rb") as file, beside.open("wb") as rewound:
             for batch in batches(file, needed):
                 kept = []
                 for index, (text, line) in enumerate(batch, start=before):
-                    if line is None or (line[STEP] > env_steps and index < (written or 0)):
+                    if line is None or (line[STEP] > env_steps and index < written):
                         strange.append(text)
                         continue
                     self.written = max(self.written, line[STEP])
-                    again = line[STEP] == env_steps and written is not None and index >= written
+                    again = unfinished and line[STEP] == env_steps and index >= written
                     if line[STEP] <= env_steps and not again:
                         kept.append(text.rstrip(b"\r\n") + b"\n")
                 rewound.writelines(kept)

@@ -33,17 +33,20 @@ class RunLog:
         settings: Settings,
         warn: Callable[[str], None],
         marks: Mapping[str, Any] = MappingProxyType({}),
+        *,
+        unevaluated: bool = False,
     ):
         """Lines beyond `env_steps` belong to work that a kill undid and that will be done again: they are dropped.
 
         Args:
             warn: is told what goes wrong with a logger, and what was found wrong in a file.
             marks: what `marks` was at `env_steps`.
+            unevaluated: whether the epoch that ended there had not been evaluated: its lines will be written again.
         """
         self._run_dir, self._lane = run_dir, tuple(settings.lanes[0])
         needed = (jsonl.STEP, *self._lane)
         self._files = {
-            name: jsonl.Growing(run_dir / name, env_steps, needed, marks.get(name), warn)
+            name: jsonl.Growing(run_dir / name, env_steps, needed, marks.get(name), warn, unfinished=unevaluated)
             for name in (METRICS_FILE, EPISODES_FILE)
         }
         written = max(file.written for file in self._files.values())

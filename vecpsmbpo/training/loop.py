@@ -113,7 +113,9 @@ class _Session:
             if processes.is_first():
                 config.save(settings, self.run_dir)  # now that it is known to be the run's own
                 marks = saved.host.get("logs", {}) if saved else {}
-                self.log = metrics.RunLog(self.run_dir, self.env_steps, settings, _warn, marks)
+                self.log = metrics.RunLog(
+                    self.run_dir, self.env_steps, settings, _warn, marks, unevaluated=self.to_evaluate
+                )
                 opened.callback(self.log.close)
         self.display = Display(driver.algorithm, self.env_steps, None if processes.is_first() else Console(quiet=True))
         self.stopped_by = 0  # the signal that any process was sent
