@@ -38,14 +38,16 @@ def mixed(tmp_path):
 
 LONGEST = (
     "test_resume",
-    "test_envs",
     "test_drivers",
+    "test_envs",
     "test_run",
+    "test_processes",
     "test_switches",
-    "test_adapters",
     "test_cli",
-    "test_slbo",
-    "test_planning",
+    "test_health",
+    "test_damage",
+    "test_adapters",
+    "test_members",
     "test_layout",
 )
 
