@@ -146,8 +146,8 @@ def _run(settings: Settings) -> tuple[int, bool]:
 
 def _leave(status: int) -> NoReturn:
     """Ends the process at once: the writer threads of orbax would each report the same disk again, in tracebacks of
-    their own, while the interpreter ends; there may be no memory for that; and JAX would wait for the
-    processes that have left."""
+    their own, while the interpreter ends; there may be no memory for that; and JAX would wait for the processes that
+    have left."""
     crash.end()
     os._exit(status)
 

@@ -108,8 +108,8 @@ class GaussianMLP(nn.Module):
 def layer_norm(x: Float[Array, "*batch H"]) -> Float[Array, "*batch H"]:
     """Each row at mean 0 and variance 1 (Ba et al., 2016).
 
-    Without gain and offset, which the dense layers around it have, and in as few passes as XLA's code for a
-    CPU can make of it: an update of 64 columns takes 1.3 times the plain one there (docs/lab_notes.md).
+    Without gain and offset, which the dense layers around it have: an update of 64 columns takes 1.3 times the plain
+    one on a CPU (docs/lab_notes.md).
     """
     exact = x.astype(jnp.float32)
     return rms_norm(exact - jnp.mean(exact, axis=-1, keepdims=True)).astype(x.dtype)

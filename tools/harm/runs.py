@@ -102,6 +102,15 @@ def started(
     return subprocess.Popen(train, cwd=cwd, env=surrounded, stdout=pipe, stderr=pipe, text=True, preexec_fn=obey)
 
 
+def errors_of(process: subprocess.Popen) -> str:
+    """What a process said by its end, which is put to it if it does not come by itself."""
+    try:
+        return process.communicate(timeout=ANSWER_S)[1]
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.communicate()[1] + "has not ended"
+
+
 def said_until(process: subprocess.Popen, word: str) -> None:
     """Waits until a process has begun a line with `word`, or ended."""
     assert process.stdout is not None

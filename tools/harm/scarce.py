@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tools.harm.runs import (
-    ANSWER_S,
     END,
     FINE,
     RUN,
     SAME,
     Found,
     command,
+    errors_of,
     one_line,
     said_until,
     same_end,
@@ -63,11 +63,7 @@ def limits(folder: Path, options: dict) -> Iterator[Found]:
             said_until(process, word)
             held = int(Path(f"/proc/{process.pid}/statm").read_text().split()[0]) * resource.getpagesize()
             resource.prlimit(process.pid, kind, (held + amount,) * 2)
-        try:
-            errors = process.communicate(timeout=ANSWER_S)[1]
-        except subprocess.TimeoutExpired:
-            process.kill()
-            errors = process.communicate()[1] + "has not ended"
+        errors = errors_of(process)
         ended = SAME if process.returncode == 0 else one_line(process.returncode, errors, expected=None)
         if ended in FINE:
             command(*arguments, cwd=folder)

@@ -8,7 +8,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from tools.harm.runs import ANSWER_S, END, ONE_LINE, RUN, Found, here, one_line, same_end, started
+from tools.harm.runs import END, ONE_LINE, RUN, Found, errors_of, here, one_line, same_end, started
 
 SHIM = Path(__file__).with_name("writes.c")
 
@@ -26,11 +26,7 @@ def writes(folder: Path, options: dict) -> Iterator[Found]:
         surroundings = {"LD_PRELOAD": str(shim), "WRITES_BELOW": str(run_dir), "WRITES_LOG": f"{run_dir}.log"}
         surroundings |= {f"WRITES_{name.upper()}": str(value) for name, value in told.items()}
         process = started(*run, f"run_dir={run_dir}", cwd=folder, one_thread=False, surroundings=surroundings)
-        try:
-            errors = process.communicate(timeout=ANSWER_S)[1]
-        except subprocess.TimeoutExpired:
-            process.kill()
-            errors = process.communicate()[1] + "has not ended"
+        errors = errors_of(process)
         return process.returncode, errors
 
     reference = folder / "reference"

@@ -17,8 +17,6 @@ from vecpsmbpo.sweeps.job import ASKING, Elsewhere, Outcome, Run, train
 
 # Names that submitit has for every executor. What else `configs/hydra/launcher/submitit_slurm.yaml` lists is Slurm's.
 GENERIC = ("name", "timeout_min", "mem_gb", "cpus_per_task", "gpus_per_node", "stderr_to_stdout")
-
-
 # States of Slurm's from which a job does not come back by itself; one that nobody knows any more has ended, too.
 ENDED = ("boot_fail", "cancelled", "completed", "deadline", "failed", "node_fail", "out_of_memory", "timeout", "gone")
 ASK_AGAIN_S = 60  # at most; what a job has to say itself is seen at once

@@ -138,7 +138,7 @@ class PsMbpo(Algorithm):
         since all are asked about the same states, the real starts, and since none may promise more or less than the
         rewards seen so far allow: a critic that runs away is not preferred for it.
         """
-        starts, moments = state.own.starts, state.moments
+        starts = state.own.starts
         if starts is None:
             return None
         nets = self.nets
@@ -149,8 +149,7 @@ class PsMbpo(Algorithm):
             q = jnp.minimum(*nets.critic.values(agent.critic, starts, action))
             return jnp.sum(jnp.where(known, q, 0.0)) / jnp.sum(known)
 
-        reward_range = sac.RewardRange(moments.lowest_reward, moments.highest_reward)
-        least, most = sac.target_range(reward_range, jnp.float32(0.0), state.hyper, self.spec.action_size)
+        least, most = sac.target_range(_reward_range(state), jnp.float32(0.0), state.hyper, self.spec.action_size)
         return jnp.clip(self.layout.all_members(jax.vmap(value)(state.agents)), least, most)
 
     def _of_member(
@@ -269,8 +268,7 @@ class PsMbpo(Algorithm):
         noise = jax.vmap(partial(sac.Noise.draw, shape=shape))(layout.keys(update_key, ids))
         batches, noise = layout.part((batches, noise), axis=2)
 
-        moments = state.moments
-        reward_range = sac.RewardRange(moments.lowest_reward, moments.highest_reward) if settings.clip_targets else None
+        reward_range = _reward_range(state) if settings.clip_targets else None
         rate = sac.learning_rate(settings, state.hyper.policy_learning_rate, counters.env_steps)
         hyper = state.hyper.replace(policy_learning_rate=rate)
 
@@ -302,3 +300,8 @@ class PsMbpo(Algorithm):
         from_real = jax.random.uniform(source_key, shape) < real_ratio
         rows = jnp.where(from_real[..., None], state.real[real_index], imagined[imagined_index])
         return self._unpack(rows)
+
+
+def _reward_range(state: SeedState) -> sac.RewardRange:
+    """Of all real steps so far."""
+    return sac.RewardRange(state.moments.lowest_reward, state.moments.highest_reward)
