@@ -17,6 +17,7 @@ from vecpsmbpo.drivers.common import split_for_episodes
 from vecpsmbpo.programs import evaluation_keys, initial_inputs
 
 DISCOUNT = 0.5
+EVALUATED = 5  # steps of an evaluation's episode; those that are learned from are shorter
 STEPS = 1000  # after 600, Q is still 0.14 below its limit (mean over ten seeds), after these 0.06
 
 
@@ -66,7 +67,7 @@ CASES = [
 @pytest.fixture(scope="module", params=CASES, ids=str)
 def trained(request):
     kind, terminates, algo = request.param
-    settings = settings_for(algo=algo)
+    settings = settings_for(algo=algo, episode_length=EVALUATED, train_episode_length=probes.EPISODE_LENGTH)
     driver = make_driver(kind, terminates, settings)
     state, news = driver.run(driver.init(*initial_inputs(settings)), settings.epoch_steps // settings.stride)
     return settings, driver, terminates, state, news
@@ -132,8 +133,8 @@ def test_evaluation_plays_whole_episodes_of_the_mean_action(trained):
     settings, driver, terminates, state, _ = trained
     returns = driver.evaluate(state, evaluation_keys(settings, STEPS), 3)
     assert returns.episode_return.shape == (1, 3)
-    assert (returns.length == (2 if terminates else probes.EPISODE_LENGTH)).all()
-    assert (returns.episode_return > 0.85).all()
+    assert (returns.length == (2 if terminates else EVALUATED)).all()
+    assert (returns.episode_return > (0.85 if terminates else 1.7)).all()  # one and two steps are rewarded
 
 
 def test_inputs_are_whitened_by_all_the_data(trained):

@@ -46,7 +46,7 @@ class HostDriver:
         self.compile_seconds = 0.0
         self._make_env = make_env
         self._env = env
-        self._env.episode_length = self.settings.episode_length
+        self._env.episode_length = self.settings.training_limit
         specs, seeds = self.layout.specs(), self.layout.specs().seeds
         jit, before = self.layout.jit_shard_map, specs.without_rings()
         self._init = jit(self._init_local, (BY_SEED,) * 3, specs, compiler_options=COMPILED_QUICKLY)

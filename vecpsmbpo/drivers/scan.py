@@ -106,7 +106,7 @@ class ScanDriver:
         seeds = seeds.replace(memory=memory)
         env = jax.vmap(self._step_env)(state.env, action)
         transition = Transition(obs, action, env.reward, env.obs, env.done)
-        truncated = (seeds.episode.length + 1 >= self.settings.episode_length) & (env.done == 0)
+        truncated = (seeds.episode.length + 1 >= self.settings.training_limit) & (env.done == 0)
         counters, seeds, end = observe_and_learn(
             self.algorithm, state.counters, seeds, transition, truncated, keys[:, 1:3], learning
         )

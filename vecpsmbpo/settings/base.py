@@ -40,6 +40,7 @@ class Settings:
     # the loop around it
     epoch_steps: int = whole(1)
     episode_length: int = whole(0)
+    train_episode_length: int = whole(0)
     eval_episodes: int = whole(1)
     eval_policy: str = choice("posterior", "best", "average")
     eval_actions: str = choice("mean", "sampled")
@@ -80,6 +81,11 @@ class Settings:
     def summary(self) -> str:
         """How much learns, in words."""
         return f"N = {self.n_models} model(s)"
+
+    @property
+    def training_limit(self) -> int:
+        """Control steps after which an episode that is learned from is truncated."""
+        return self.train_episode_length or self.episode_length
 
     @property
     def policies_per_model(self) -> int:
