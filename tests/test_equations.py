@@ -276,12 +276,12 @@ def test_longer_rollouts_start_from_fewer_states_and_are_never_cut():
     from vecpsmbpo import config
 
     settings = config.compose(["env=hopper"])
-    chunk, capacity = imagination.chunk_size(settings), imagination.ring_capacity(settings)
+    batch, capacity = imagination.batch_size(settings), imagination.ring_capacity(settings)
     assert capacity == 10**6
-    assert 100_000 % chunk == 0
+    assert 100_000 % batch == 0
     for horizon in range(1, 16):
-        starts = chunk * int(imagination.chunks_per_refresh(settings, jnp.int32(horizon)))
-        assert starts == (100_000 if horizon <= 10 else capacity // (horizon * chunk) * chunk)
+        starts = batch * int(imagination.batches_per_refresh(settings, jnp.int32(horizon)))
+        assert starts == (100_000 if horizon <= 10 else capacity // (horizon * batch) * batch)
         assert starts * horizon <= capacity
 
 
@@ -299,14 +299,14 @@ def test_policies_learn_from_the_rows_of_one_epoch_of_refreshes_at_the_horizons_
 @pytest.mark.parametrize(
     ("starts", "capacity", "horizon"), [(100_003, 10**6, 1), (100_000, 50_000, 25), (10_000, 7, 7)]
 )
-def test_chunks_are_large_and_the_ring_holds_a_rollout_of_each(starts, capacity, horizon):
+def test_batches_are_large_and_the_ring_holds_a_rollout_of_each(starts, capacity, horizon):
     """Also of a prime number of starts, and in a ring that is small for the horizon."""
     settings = tiny(rollout_starts=starts, imagined_capacity=capacity, horizon_last=horizon)
-    chunk, ring = imagination.chunk_size(settings), imagination.ring_capacity(settings)
-    chunks = int(imagination.chunks_per_refresh(settings, jnp.int32(horizon)))
-    assert chunk * horizon * chunks <= ring <= capacity
-    assert chunk >= min(2000, capacity // horizon // 2)
-    assert chunk * chunks > 0.9 * min(starts, capacity // horizon) - chunk
+    batch, ring = imagination.batch_size(settings), imagination.ring_capacity(settings)
+    batches = int(imagination.batches_per_refresh(settings, jnp.int32(horizon)))
+    assert batch * horizon * batches <= ring <= capacity
+    assert batch >= min(2000, capacity // horizon // 2)
+    assert batch * batches > 0.9 * min(starts, capacity // horizon) - batch
 
 
 def _batch(spec, reward=None) -> Transition:

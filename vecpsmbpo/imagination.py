@@ -11,14 +11,14 @@ from vecpsmbpo import dynamics, networks, replay, sac
 from vecpsmbpo.settings.parts import ImaginationSettings
 from vecpsmbpo.types import EnvSpec, Model, Params, Transition, Whole
 
-LARGEST_CHUNK = 4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
+LARGEST_BATCH = 4096  # rows of one member in flight: enough to fill the machine, small enough to stay in cache
 
 
-def chunk_size(settings: ImaginationSettings) -> int:
+def batch_size(settings: ImaginationSettings) -> int:
     """Start states rolled out together: an even part of `rollout_starts`, and at most as many as the ring can hold the
     longest rollouts of."""
     starts = settings.rollout_starts
-    most = max(min(LARGEST_CHUNK, settings.imagined_capacity // longest_horizon(settings)), 1)
+    most = max(min(LARGEST_BATCH, settings.imagined_capacity // longest_horizon(settings)), 1)
     fewest = -(-starts // most)
     # Parts that leave no rest, if there are some nearly as large; else a few starts less.
     parts = next((count for count in range(fewest, 2 * fewest + 1) if starts % count == 0), fewest)
@@ -32,12 +32,12 @@ def longest_horizon(settings: ImaginationSettings) -> int:
 def ring_capacity(settings: ImaginationSettings) -> int:
     """C_M: what one epoch can imagine for a member at the longest horizon, up to `imagined_capacity`.
 
-    A multiple of the chunk, so that a block of rows never wraps. At a shorter horizon it would hold many epochs: see
+    A multiple of the batch, so that a block of rows never wraps. At a shorter horizon it would hold many epochs: see
     `retained_rows`.
     """
     wanted = settings.rollout_starts * longest_horizon(settings) * settings.refreshes_per_epoch
-    chunk = chunk_size(settings)
-    return max(min(wanted, settings.imagined_capacity) // chunk, 1) * chunk
+    batch = batch_size(settings)
+    return max(min(wanted, settings.imagined_capacity) // batch, 1) * batch
 
 
 def horizon(settings: ImaginationSettings, env_steps: Int[Array, "*steps"] | int) -> Int[Array, "*steps"]:
@@ -52,19 +52,19 @@ def horizon(settings: ImaginationSettings, env_steps: Int[Array, "*steps"] | int
     return jnp.floor(jnp.clip(value, min(first, last), max(first, last))).astype(jnp.int32)
 
 
-def chunks_per_refresh(settings: ImaginationSettings, horizon: Int[Array, "*steps"] | int) -> Int[Array, "*steps"]:
-    """How many chunks of start states one refresh rolls out.
+def batches_per_refresh(settings: ImaginationSettings, horizon: Int[Array, "*steps"] | int) -> Int[Array, "*steps"]:
+    """How many batches of start states one refresh rolls out.
 
     When starts × horizon would exceed the ring, there are fewer starts; a rollout is never cut short.
     """
-    chunk = chunk_size(settings)
-    return jnp.clip(ring_capacity(settings) // (horizon * chunk), 1, settings.rollout_starts // chunk)
+    batch = batch_size(settings)
+    return jnp.clip(ring_capacity(settings) // (horizon * batch), 1, settings.rollout_starts // batch)
 
 
 def rows_per_refresh(settings: ImaginationSettings, env_steps: Int[Array, "*steps"] | int) -> Int[Array, "*steps"]:
     """How many transitions one refresh imagines for each member."""
     now = horizon(settings, env_steps)
-    return chunks_per_refresh(settings, now) * now * chunk_size(settings)
+    return batches_per_refresh(settings, now) * now * batch_size(settings)
 
 
 def retained_rows(settings: ImaginationSettings, env_steps: Whole) -> Int[Array, ""]:

@@ -54,7 +54,7 @@ class PsMbpo(Algorithm):
         """Minibatches of a step, or rows in flight of a rollout."""
         settings = self.settings
         minibatches = 3 * settings.updates_per_step * settings.policy_batch_size * row
-        return max(minibatches, imagination.chunk_size(settings) * (2 * row + 8 * settings.model_hidden_size))
+        return max(minibatches, imagination.batch_size(settings) * (2 * row + 8 * settings.model_hidden_size))
 
     def init(self, key: jax.Array, hyper: Hyper) -> SeedState:
         state, settings = super().init(key, hyper), self.settings
@@ -209,16 +209,16 @@ class PsMbpo(Algorithm):
         help, are stored as zeros, and the lane is frozen before anything is kept that was learned from them.
         """
         settings, spec, layout = self.settings, self.spec, self.layout
-        chunk = imagination.chunk_size(settings)
+        batch = imagination.batch_size(settings)
         horizon = imagination.horizon(settings, counters.env_steps)
-        chunks = jnp.where(enabled, imagination.chunks_per_refresh(settings, horizon), 0)
+        batches = jnp.where(enabled, imagination.batches_per_refresh(settings, horizon), 0)
         ids = layout.member_ids()
         shared = settings.rollout_models == "any"
         models = (layout.all_models_for_members if shared else layout.models_of_members)(state.models)
 
         def real_states(keys):
-            """[P_local] -> [P_local, chunk, O]; for all members at once, as `learn` draws minibatches."""
-            draw = partial(imagination.start_states, state.real, counters.env_steps, count=chunk, spec=spec)
+            """[P_local] -> [P_local, batch, O]; for all members at once, as `learn` draws minibatches."""
+            draw = partial(imagination.start_states, state.real, counters.env_steps, count=batch, spec=spec)
             return jax.vmap(draw)(keys)
 
         imagined_step = partial(imagination.step, net=self.model_net, nets=self.nets, settings=settings, spec=spec)
@@ -234,7 +234,7 @@ class PsMbpo(Algorithm):
             rows, obs = layout.map_local(advance, models, state.agents.actor, obs, fresh, keys[:, 0])
             finite = jnp.all(jnp.isfinite(rows), axis=-1)
             imagined = replay.add(imagined, jnp.where(finite[..., None], rows, 0.0), added)
-            return imagined, sound & jnp.all(finite, axis=-1), obs, added + chunk, key
+            return imagined, sound & jnp.all(finite, axis=-1), obs, added + batch, key
 
         def rollout(c, carry):
             imagined, sound, added = carry
@@ -244,7 +244,7 @@ class PsMbpo(Algorithm):
             return imagined, sound, added
 
         start = (state.imagined, jnp.ones(ids.shape, bool), counters.imagined_rows)
-        imagined, sound, added = jax.lax.fori_loop(0, chunks, rollout, start)
+        imagined, sound, added = jax.lax.fori_loop(0, batches, rollout, start)
         counters = counters._replace(imagined_rows=replay.wrapped(added, self.ring_capacity))
         sound |= ids >= layout.n_members
         first = layout.least_of_members(jnp.min(jnp.where(sound, layout.n_members, ids)))
