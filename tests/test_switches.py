@@ -199,6 +199,27 @@ def test_members_may_be_drawn_by_what_their_critics_promise(valued):
         assert found == pytest.approx(max(by_hand, 0.0), rel=1e-4)
 
 
+def test_the_start_of_an_episode_to_come_is_not_known(valued):
+    """As where an evaluation follows an episode's end: its place in the ring still holds something else."""
+    settings, _, state, _, values = valued
+    starts = state.seeds.own.starts
+    at = [state.seeds.replace(own=state.seeds.own.replace(starts=jnp.full_like(starts, obs))) for obs in (0.25, 0.75)]
+    ring = starts.at[:, 0].set(0.25).at[:, 1].set(0.75)
+    mixed = state.seeds.replace(own=state.seeds.own.replace(starts=ring))
+
+    def of(seeds, index, length):
+        episode = seeds.episode.replace(
+            index=jnp.full_like(seeds.episode.index, index), length=jnp.full_like(seeds.episode.length, length)
+        )
+        return values(seeds.replace(episode=episode))
+
+    first, second = (np.asarray(of(seeds, 5, 1)) for seeds in at)
+    assert not np.allclose(first, second, rtol=1e-3)
+    np.testing.assert_allclose(of(mixed, 2, 0), first, rtol=1e-5)
+    np.testing.assert_allclose(of(mixed, 2, 1), (first + second) / 2, rtol=1e-5)
+    assert not np.any(of(mixed, 1, 0))
+
+
 def test_no_member_promises_more_than_rewards_allow(valued):
     settings, _, state, _, values = valued
     agents = state.seeds.agents

@@ -210,9 +210,9 @@ class Algorithm(ABC):
         index, warmups = episode.index + 1, episode.warmups + random
         stored = self._unpack(row)
         state = self.note_start(state, jnp.where(jnp.isfinite(transition.obs), transition.obs, stored.obs))
-        values = self.values(state)
-        following = self._begin_episode(state.posterior, values, state.hyper, index, warmups, random, key)
         running = episode.replace(episode_return=total, length=length)
+        values = self.values(state.replace(episode=running))
+        following = self._begin_episode(state.posterior, values, state.hyper, index, warmups, random, key)
         state = state.replace(
             real=replay.add(state.real, row[None], counters.env_steps),
             newest=row,

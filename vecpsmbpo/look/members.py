@@ -98,7 +98,7 @@ class Trained:
         return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[places]), self.of_lane(tree))
 
     def best(self) -> int:
-        """The member that has earned the most."""
+        """The member that has earned the most per episode (`posterior.best`)."""
         return int(posterior.best(self.of_lane(self.state.posterior)))
 
 

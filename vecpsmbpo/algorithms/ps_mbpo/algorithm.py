@@ -142,12 +142,13 @@ class PsMbpo(Algorithm):
         if starts is None:
             return None
         nets = self.nets
-        known = jnp.arange(posterior.STARTS) < state.episode.index
+        begun = state.episode.index - (state.episode.length == 0)
+        known = jnp.arange(posterior.STARTS) < begun
 
         def value(agent: Agent) -> jax.Array:
             action = nets.actor.distribution(agent.actor, starts).mode()
             q = jnp.minimum(*nets.critic.values(agent.critic, starts, action))
-            return jnp.sum(jnp.where(known, q, 0.0)) / jnp.sum(known)
+            return jnp.sum(jnp.where(known, q, 0.0)) / jnp.maximum(jnp.sum(known), 1)
 
         least, most = sac.target_range(_reward_range(state), jnp.float32(0.0), state.hyper, self.spec.action_size)
         return jnp.clip(self.layout.all_members(jax.vmap(value)(state.agents)), least, most)
