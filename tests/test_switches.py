@@ -201,7 +201,7 @@ def test_members_may_be_drawn_by_what_their_critics_promise(valued):
 
 def test_the_start_of_an_episode_to_come_is_not_known(valued):
     """As where an evaluation follows an episode's end: its place in the ring still holds something else."""
-    settings, _, state, _, values = valued
+    _, _, state, _, values = valued
     starts = state.seeds.own.starts
     at = [state.seeds.replace(own=state.seeds.own.replace(starts=jnp.full_like(starts, obs))) for obs in (0.25, 0.75)]
     ring = starts.at[:, 0].set(0.25).at[:, 1].set(0.75)
