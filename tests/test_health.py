@@ -144,9 +144,9 @@ def test_the_lane_s_last_line_says_when_and_where(diverged, capsys):
     ) in said
 
 
-def test_a_run_whose_lanes_are_all_frozen_stops(tmp_path, capsys):
+def test_a_run_whose_lanes_are_all_frozen_stops(backend, tmp_path, capsys):
     """Its last checkpoint can be loaded, is finite, and is not gone on from."""
-    settings = settings_for("host", [1e30, 2e30, 3e30, 4e30], tmp_path / "run")
+    settings = settings_for(backend, [1e30, 2e30, 3e30, 4e30], tmp_path / "run")
     assert training.train(settings) == 1
     assert "every lane is frozen" in capsys.readouterr().out
     state = final(settings)
@@ -158,10 +158,10 @@ def test_a_run_whose_lanes_are_all_frozen_stops(tmp_path, capsys):
     assert strict(tmp_path / "run" / "metrics.jsonl") == lines
 
 
-def test_a_real_kill_after_the_freezing(tmp_path):
+def test_a_real_kill_after_the_freezing(backend, tmp_path):
     """kill -9 as soon as the screen says so; the command again ends the run with status 1, and no line twice."""
-    arguments = [f"env.make={MAKE['host']}", f"sweep.policy_learning_rate={BAD}".replace(" ", "")]
-    arguments = argv("train", "env=custom", "backend=host", "size=tiny", "run_dir=run", *arguments)
+    arguments = [f"env.make={MAKE[backend]}", f"sweep.policy_learning_rate={BAD}".replace(" ", "")]
+    arguments = argv("train", "env=custom", f"backend={backend}", "size=tiny", "run_dir=run", *arguments)
     # On the tests' own devices: the programs are compiled already.
     where = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}, "text": True}
     process = subprocess.Popen([*arguments, "total_steps=240"], stdout=subprocess.PIPE, **where)
