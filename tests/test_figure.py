@@ -65,15 +65,21 @@ def test_every_figure_is_drawn_and_says_what_is_missing(name, tmp_path, monkeypa
         assert "ant, to step 120" in captured.out
     else:
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    said = [line for line in captured.err.splitlines() if line.startswith(f"vecpsmbpo: warning: {name}: ")]
     complete = len(list((tmp_path / "runs" / name).iterdir())) == len(list(_product(experiments._grid(name))))
-    assert complete == (captured.err == "")
+    swept = name in SWEPT  # two of more values
+    assert len(said) == (not complete) + swept
+    assert all(line.endswith(f"; to make them: vecpsmbpo train -m experiment={name} size=tiny") for line in said)
     if not complete:
-        assert captured.err.startswith(f"vecpsmbpo: warning: {name}: no run of env=")
-        assert f"to make them: vecpsmbpo train -m experiment={name} size=tiny" in captured.err
+        assert said[0].startswith(f"vecpsmbpo: warning: {name}: no run of env=")
+    if swept:
+        assert said[-1].startswith(f"vecpsmbpo: warning: {name}: 0 of 1 seeds of env=")
+        assert SWEPT[name][0] in said[-1]
 
 
 def test_figure_2_accumulates_what_was_missed(tmp_path):
-    path = looks.write(tmp_path / "fig2" / "a", looks.epochs([1]), looks.episodes(4), env="cartpole_swingup_sparse")
+    settings = {"env": "cartpole_swingup_sparse", "algo": "ps_mbpo"}
+    path = looks.write(tmp_path / "fig2" / "a", looks.epochs([1]), looks.episodes(4), **settings)
     (run,) = experiments.load("fig2", tmp_path, "tiny").runs
     steps, lost = figure.regret(run.lanes[0], 25.0)
     np.testing.assert_array_equal(steps, [25, 50, 75, 100])
@@ -104,10 +110,10 @@ def test_the_band_of_the_paper_s_figures_is_a_standard_error():
 
 
 def test_a_group_has_one_colour_in_all_panels(tmp_path, monkeypatch):
-    """Also where one of the algorithms is missing on a task."""
+    """Also where one of the algorithms is missing on a task; the legend names it all the same."""
     for env, algos in (("ant", ("ps_mbpo", "mbpo")), ("hopper", ("ops_mbpo", "mbpo", "sac"))):
         for algo in algos:
-            looks.write(tmp_path / "fig4" / f"{env}{algo}", looks.epochs([1, 2]), env=env, algo=algo)
+            looks.write(tmp_path / "fig4" / f"{env}{algo}", looks.epochs([1, 5000]), env=env, algo=algo)
     with style.styled():
         drawn = figure.draw_curves(experiments.load("fig4", tmp_path), reference="sac")
     colours = {}
@@ -117,6 +123,7 @@ def test_a_group_has_one_colour_in_all_panels(tmp_path, monkeypatch):
     assert {"PS-MBPO", "OPS-MBPO", "MBPO", "SAC", "SAC at 3M steps"} <= set(colours)
     assert all(len(found) == 1 for found in colours.values())
     assert len({*map(tuple, colours.values())}) == len(colours)
+    assert {text.get_text() for text in drawn.legends[0].get_texts()} == set(colours)
 
 
 def test_figure_13_tells_how_lambda_is_found(tmp_path):
@@ -145,12 +152,118 @@ def test_umap_figures_have_a_row_per_task_and_a_column_per_stage(tmp_path, monke
         np.testing.assert_allclose(here[:, 0], units[100 * stage : 100 * (stage + 1)])
 
 
+def test_umap_is_shown_while_it_is_at_work(tmp_path, monkeypatch):
+    for env in ("hopper", "ant"):
+        looks.write(tmp_path / "fig18" / env, looks.epochs([1]), env=env, algo="mbpo")
+    events = []
+
+    def steps(items, what):
+        for item in items:
+            events.append(item[0])
+            yield item
+
+    monkeypatch.setattr(figure.waiting, "steps", steps)
+    obs = np.arange(300.0)[:, None] * np.ones(4)
+    visited = lambda run: (events.append("visited"), states.Visited(run, np.arange(300), obs))[1]  # noqa: E731
+    monkeypatch.setattr(states, "visited", visited)
+    monkeypatch.setattr(states, "plane", states.principal_plane)
+    with style.styled():
+        figure.draw_states(experiments.load("fig18", tmp_path))
+    assert events == ["hopper", "visited", "ant", "visited"]
+
+
+def test_figure_5_has_an_asymptote_where_one_is_known(tmp_path):
+    for env in ("ball_in_cup", "cartpole_swingup_sparse", "window_open"):
+        looks.write(tmp_path / "fig5" / env, looks.epochs([0, 500]), env=env, algo="sac")
+    with style.styled():
+        drawn = figure.DRAW["fig5"](experiments.load("fig5", tmp_path))
+    names = [axis.get_legend_handles_labels()[1][1:] for axis in drawn.axes]
+    assert names == [["SAC at 100k steps"], ["SAC at 200k steps"], []]
+
+
+@pytest.mark.parametrize(("seeds", "said"), [(1, "one seed"), (2, "mean of 2 seeds, band: standard error")])
+def test_a_title_says_what_is_drawn(seeds, said, tmp_path):
+    lines = [line for seed in range(seeds) for line in looks.epochs([1, 2], seed=seed)]
+    looks.write(tmp_path / "fig15" / "a", lines, env="hopper", algo="mbpo", num_seeds=seeds)
+    with style.styled():
+        drawn = figure.draw_curves(experiments.load("fig15", tmp_path))
+    assert drawn.get_suptitle() == f"experiment=fig15 size=tiny: {said}"
+
+
+# ── which runs are an experiment's ──────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("name", list(figure.DRAW))
+def test_runs_of_something_else_are_no_figure(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(states, "check_umap", lambda: None)
+    looks.write(tmp_path / "runs" / name / "a", looks.epochs([1]), looks.episodes(3))
+    assert cli.main(["figure", name]) == 2
+    line = f"vecpsmbpo: {name}: none of the runs in runs/{name} is one of its; to make them: vecpsmbpo train -m"
+    assert capsys.readouterr().err == f"{line} experiment={name} size=cpu\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+def test_a_run_of_something_else_is_left_out(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    saved = _drawn(monkeypatch)
+    for algo in ("mbpo", "ops_mbpo"):  # the wrong one first
+        looks.write(
+            tmp_path / "runs" / "fig9" / algo, looks.epochs([1, 2, 3]), looks.episodes(5), env="hopper", algo=algo
+        )
+    assert cli.main(["figure", "fig9"]) == 0
+    err = capsys.readouterr().err
+    assert err == "vecpsmbpo: warning: runs/fig9/mbpo: left out, fig9 has no env=hopper algo=mbpo\n"
+    assert saved[0].get_suptitle().startswith("hopper, OPS-MBPO: experiment=fig9 size=tiny, seed 0, τ = ")
+
+
+def test_what_an_experiment_lacks_is_said_with_the_command_that_makes_it(tmp_path):
+    lines = [line for ratio in (0.0, 0.1) for line in looks.epochs([1, 2, 3], real_ratio=ratio)]
+    settings = {"env": "cartpole_swingup_sparse", "algo": "ps_mbpo", "sweep.real_ratio": "[0,0.1]"}
+    looks.write(tmp_path / "fig2" / "a", lines, size="cpu", total_steps=6000, updates_per_step=7, **settings)
+    lacking, foreign, unfinished = experiments.load("fig2", tmp_path).warnings()
+    point = "seeds of env=cartpole_swingup_sparse algo=ps_mbpo real_ratio="
+    assert lacking == (
+        f"fig2: 1 of 3 {point}0.0, 1 of 3 {point}0.1, 0 of 3 {point}0.3 and 3 more; "
+        "to make them: vecpsmbpo train -m experiment=fig2 size=cpu"
+    )
+    wanted = config.compose_point("fig2", ["size=cpu", "env=cartpole_swingup_sparse", "algo=ps_mbpo"])
+    assert foreign == (
+        f"{tmp_path}/fig2/a: is not as experiment=fig2 makes it: total_steps=6000 (not {wanted.total_steps}), "
+        f"updates_per_step=7 (not {wanted.updates_per_step})"
+    )
+    assert "has come to step 120 of 6,000" in unfinished
+
+
+# ── figures 9 and 10 of any run ─────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_figure_9_of_any_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    saved = _drawn(monkeypatch)
+    looks.write(tmp_path / "a", looks.epochs([1, 2, 3]), looks.episodes(5), temperature=7, train_episode_length=20)
+    assert cli.main(["figure", "fig9", "a", "out=a.png"]) == 0
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("written: a.png\n", "")
+    (drawn,) = saved
+    assert drawn.get_suptitle() == "cartpole_swingup, OPS-MBPO: size=tiny, seed 0, τ = 7"
+    *_, returns = (axis for axis in drawn.axes if axis.get_ylabel() == "return")
+    names = returns.get_legend_handles_labels()[1]
+    assert names == ["evaluation return", "return in training (episodes of 20 steps)"]
+
+
 @pytest.fixture
 def shelf(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for size in ("tiny", "cpu"):
         looks.write(tmp_path / "runs" / "fig9" / size, looks.epochs([1]), looks.episodes(3), env="hopper", size=size)
     looks.write(tmp_path / "runs" / "fig8" / "a", looks.epochs([1]), env="window_open")
+    sparse = {"env": "cartpole_swingup_sparse"}
+    looks.write(tmp_path / "runs" / "fig10" / "a", looks.epochs([1]), **sparse)
+    looks.write(tmp_path / "runs" / "fig16" / "a", looks.epochs([1], eval_return=None), env="hopper", algo="ps_mbpo")
+    looks.write(tmp_path / "runs" / "sac", looks.epochs([1]), looks.episodes(3, (1, 1)), algo="sac", n_policies=1)
+    (tmp_path / "other" / "fig2").mkdir(parents=True)
+    looks.write(tmp_path / "other" / "fig2" / "a", looks.epochs([1]), algo="ps_mbpo", **sparse)
     return tmp_path
 
 
@@ -168,6 +281,13 @@ def shelf(tmp_path, monkeypatch):
         ),
         (["fig9", "size=big"], "size=big: must be one of cpu, paper, tiny"),
         (["fig9", "size=cpu", "out=a.csv"], "out=a.csv: must be a file that ends in .png, .svg, .pdf"),
+        (["fig10"], "run_dir=runs/fig10/a: has no whole episode in episodes.jsonl yet"),
+        (["fig2", "runs=other"], "run_dir=other/fig2/a: has no whole episode in episodes.jsonl yet"),
+        (["fig16"], "fig16: eval_return is null in every line of its runs"),
+        (["fig9", "runs/sac"], "run_dir=runs/sac: SAC draws no member to act, so that there are no weights to show"),
+        (["fig9", "runs/fig9"], "run_dir: figure takes 1 run, not 2"),
+        (["fig9", "runs/sac", "size=cpu"], "size=cpu: is of the runs of experiment=fig9, and a run is named"),
+        (["fig4", "runs/sac"], "figure: fig4 is of the runs of experiment=fig4; fig9 and fig10 take a run"),
         (["fig8"], "figure: this one needs umap-learn; pip install 'vecpsmbpo[umap]'"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -176,10 +296,9 @@ def test_a_mistake_is_one_line(arguments, line, shelf, monkeypatch, capsys):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert cli.main(["figure", *arguments]) == 2
     captured = capsys.readouterr()
-    errors = [text for text in captured.err.splitlines() if "warning" not in text]
-    assert len(errors) == 1
-    assert errors[0].startswith(f"vecpsmbpo: {line}")
-    assert [path.name for path in shelf.iterdir()] == ["runs"]
+    assert captured.err.startswith(f"vecpsmbpo: {line}")
+    assert captured.err.count("\n") == 1
+    assert sorted(path.name for path in shelf.iterdir()) == ["other", "runs"]
 
 
 def test_every_experiment_has_a_figure():

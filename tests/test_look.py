@@ -8,7 +8,8 @@ import pytest
 
 from tests import looks
 from tests.helpers import environment
-from vecpsmbpo import cli
+from vecpsmbpo import algorithms, cli
+from vecpsmbpo.look import plot, published, runs, style, waiting
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
@@ -45,8 +46,105 @@ def test_plot_draws_over_published_curves(tmp_path):
     path = looks.write(tmp_path / "a", looks.epochs([1, 2]), env="hopper")
     out = tmp_path / "a.svg"
     assert cli.main(["plot", str(path), "reference=mbpo,sac", f"out={out}"]) == 0
-    assert "MBPO, published" in out.read_text()
-    assert "SAC at 3M steps" in out.read_text()
+    assert ">MBPO, published (± s.d.)<" in out.read_text()
+    assert ">SAC at 3M steps<" in out.read_text()
+
+
+def test_a_published_level_is_a_line_a_span_or_a_remark(tmp_path):
+    with style.styled():
+        _, panels = style.grid(4, 3)
+        sparse = "cartpole_swingup_sparse"
+        cases = (("ball_in_cup", 700), (sparse, 700), ("hopper", 700), (sparse, 60))
+        for axis, (task, highest) in zip(panels, cases, strict=True):
+            axis.plot([0, 1], [0, highest])
+            plot.draw_references(axis, [published.reference("sac", task)])
+    line, span, remark, another = panels
+    assert line.get_lines()[-1].get_ydata()[0] == 970
+    assert (span.patches[0].get_y(), span.patches[0].get_height()) == (55, 800 - 55)
+    assert (len(remark.get_lines()), remark.get_ylim()[1] < 800) == (1, True)
+    assert remark.get_title(loc="right") == "SAC at 3M: 3,809 ↑"
+    assert another.get_title(loc="right") == "SAC at 200k: 55–800 ↑"
+
+
+def test_names_and_titles_are_text_and_no_mathematics(tmp_path, monkeypatch):
+    """Nor are they anything of matplotlib's own: it keeps names that begin with _ for itself."""
+    monkeypatch.chdir(tmp_path)
+    names = ["_a", r"$\frac$", "$b$"]
+    for name in names:
+        looks.write(tmp_path / name, looks.epochs([1, 2]))
+    assert cli.main(["plot", *names, r"title=$\frac$ of $", "out=a.svg"]) == 0
+    assert cli.main(["plot", *names, "out=a.png"]) == 0
+    written = (tmp_path / "a.svg").read_text().replace("\u200b", "")
+    for said in (*names, r"$\frac$ of $"):
+        assert f">{said}<" in written
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1e308, float("inf"), -1e308])
+def test_what_no_run_can_have_earned_counts_for_nothing(value, tmp_path, capsys):
+    path = looks.write(
+        tmp_path / "a", [line for seed in (0, 1) for line in looks.epochs([1, value, 3], seed=seed)], num_seeds=2
+    )
+    assert cli.main(["plot", str(path), f"out={tmp_path / 'a.png'}"]) == 0
+    assert cli.main(["compare", str(path), f"out={tmp_path / 'a.csv'}", "window=2"]) == 0
+    assert capsys.readouterr().err == ""
+    head, row = (line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines())
+    assert row[head.index("final")] == "2"  # of 1 and 3
+
+
+def test_returns_in_training_say_where_their_episodes_are_shorter(tmp_path):
+    """train_episode_length: a return of 20 steps is none of 25."""
+    short = looks.write(tmp_path / "a", looks.epochs([1, 2]), train_episode_length=20)
+    same = looks.write(tmp_path / "b", looks.epochs([1, 2]))
+    for paths, said in (
+        ([same], "return in training"),
+        ([short], "(episodes of 20 steps)"),
+        ([short, same], "(episodes of 20 or 25 steps)"),
+    ):
+        assert cli.main(["plot", *map(str, paths), "y=eval_return,train_return", f"out={tmp_path / 'a.svg'}"]) == 0
+        assert f">{said}<" in (tmp_path / "a.svg").read_text()
+        assert ">evaluation return<" in (tmp_path / "a.svg").read_text()
+
+
+def test_an_algorithm_looks_the_same_whatever_is_beside_it():
+    three, five = ["OPS-MBPO", "MBPO", "SAC"], ["OPS-MBPO", "PS-MBPO", "MBPO", "PETS", "SAC"]
+    few, many = style.looks_of(three), style.looks_of(five)
+    assert {name: many[name] for name in three} == few
+    assert style.looks_of(["SAC"]) == {"SAC": many["SAC"]}
+    assert len(set(many.values())) == len({look.colour for look in many.values()}) == 5
+    assert set(style.ALGORITHMS) <= {entry.title for entry in algorithms.TABLE.values()}
+    mixed = style.looks_of(["OPS-MBPO, λ = 0.1", "OPS-MBPO, λ = 0.3", "SAC, λ = 0", "own"])
+    assert mixed["SAC, λ = 0"] == many["SAC"]
+    assert len({look.colour for look in mixed.values()}) == 4
+
+
+def test_panels_stand_in_even_rows_and_apart(tmp_path):
+    shape = {count: style.grid(count, 3)[1][0].get_gridspec().get_geometry() for count in range(1, 8)}
+    assert shape == {1: (1, 1), 2: (1, 2), 3: (1, 3), 4: (2, 2), 5: (2, 3), 6: (2, 3), 7: (3, 3)}
+    with style.styled():
+        figure, (left, right) = style.grid(2, 3)
+        right.set_ylabel("return in training")
+        figure.draw_without_rendering()
+    gap = right.get_tightbbox().x0 - left.get_window_extent().x1
+    assert gap > 0.15 * figure.dpi  # inches
+
+
+def test_somebody_at_a_terminal_sees_how_far_it_has_come(mixed, tmp_path, monkeypatch, capsys):
+    commands = (["plot", f"out={tmp_path / 'a.png'}"], ["compare"])
+    for command, *rest in commands:
+        assert cli.main([command, *map(str, mixed), *rest]) == 0
+        assert "reading" not in capsys.readouterr().err
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich's sign for a terminal
+    for soon, shown in ((waiting.SOON, False), (0, True)):
+        monkeypatch.setattr(waiting, "SOON", soon)
+        for command, *rest in commands:
+            assert cli.main([command, *map(str, mixed), *rest]) == 0
+            assert ("reading" in capsys.readouterr().err) == shown
+    (run,) = runs.load_all(mixed[:1])
+    assert run.episodes == {}
+    assert "reading" in capsys.readouterr().err
+    assert runs.load(mixed[0]).episodes == {}  # nobody waits, as beside a training's own display
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("command", ["plot", "compare"])
@@ -63,9 +161,10 @@ def test_compare_writes_every_kind_of_table(mixed, suffix, tmp_path, capsys):
     out = [f"out={tmp_path / 'table'}.{suffix}"] if suffix else []
     assert cli.main(["compare", *map(str, mixed), "threshold=2", *out]) == 0
     text = (tmp_path / f"table.{suffix}").read_text() if suffix else capsys.readouterr().out
-    for said in ("OPS-MBPO", "PS-MBPO", "final", "best", "area", "steps to", "P(better)"):
+    for said in ("OPS-MBPO", "PS-MBPO", "final", "best", "area", "steps to", "P(better)", "seconds"):
         assert said in text
     assert "frozen" in text
+    assert suffix == "csv" or "seconds: wall time of the program that a seed was in" in " ".join(text.split())
 
 
 @pytest.fixture
@@ -73,6 +172,8 @@ def shelf(tmp_path):
     """Directories of every kind; the folder that commands run in."""
     looks.write(tmp_path / "run", looks.epochs([1, 2]))
     looks.write(tmp_path / "hopper", looks.epochs([1, 2]), env="hopper")
+    looks.write(tmp_path / "null", looks.epochs([1, 2], eval_return=None))
+    looks.write(tmp_path / "unknown", looks.epochs([1, 2]), env="brax", **{"env.id": "Hopper"})
     looks.write(tmp_path / "begun", [])
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("")
@@ -91,7 +192,11 @@ MISTAKES = [
     (["plot", "run", "z=1"], "z=1: no such option of plot; one of average, group"),
     (["plot", "run", "y=eval_retrun"], "y=eval_retrun: the runs have no such column; did you mean eval_return"),
     (["plot", "run", "x=epochs"], "x=epochs: must be one of env_steps, seconds"),
-    (["plot", "run", "smooth=0"], "smooth=0: must be a whole number, at least 1"),
+    (["plot", "run", "smooth=0"], "smooth=0: must be a whole number from 1 to 1000000"),
+    (
+        ["plot", "run", "smooth=99999999999999999999999"],
+        "smooth=99999999999999999999999: must be a whole number from 1",
+    ),
     (["plot", "run", "group=alog"], "group=alog: no such setting; did you mean algo"),
     (["plot", "run", "reference=ppo"], "reference=ppo: must be of mbpo, sac"),
     (["plot", "run", "reference=mbpo"], "reference=mbpo: nothing is published for cartpole_swingup"),
@@ -100,6 +205,21 @@ MISTAKES = [
     (["plot", "run", "out=file/a.png"], "out=file/a.png: cannot be written (Not a directory)"),
     (["compare", "run", "steps=90"], "steps=90: run has not come to it (seed 0)"),
     (["compare", "run", "target=high"], "target=high: must be a number"),
+    (
+        ["compare", "run", "floor=30"],
+        "floor=30: what counts as 0 on cartpole_swingup (30) must be below what counts as 1",
+    ),
+    (
+        ["compare", "run", "target=0"],
+        "target=0: what counts as 0 on cartpole_swingup (0) must be below what counts as 1",
+    ),
+    (["compare", "run", "floor=2", "target=1"], "floor=2 target=1: what counts as 0 on cartpole_swingup (2) must be"),
+    (
+        ["compare", "unknown", "floor=2"],
+        "floor=2: needs target=, too: what is to be reached on brax Hopper is not known",
+    ),
+    (["compare", "null"], "y=eval_return: is null in every line of the runs up to step 80"),
+    (["plot", "null"], "y=eval_return: there is no step at which all seeds of a group have a value"),
     (["compare", "run", "baseline=SAC"], "baseline=SAC: no such group; one of OPS-MBPO"),
     (["compare", "run", "out=empty/a.xls"], "out=empty/a.xls: must be a file that ends in .csv, .md, .txt"),
 ]

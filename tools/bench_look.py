@@ -2,7 +2,8 @@
 
     python tools/bench_look.py > results/look.csv
 
-`report` reads one run with up to a million episodes; `plot` and `compare` read up to a hundred runs.
+`report` reads one run with up to a million episodes, `read` is the reading of it alone; `plot` and `compare` read up to
+a hundred runs.
 """
 
 import csv
@@ -18,6 +19,7 @@ from vecpsmbpo import config
 
 EPISODES, RUNS = (250_000, 500_000, 1_000_000), (25, 50, 100)
 EPOCHS, SEEDS, MEMBERS = 125, 4, (5, 5)
+READ = "import pathlib, sys; from vecpsmbpo.look import runs; runs.load(pathlib.Path(sys.argv[1])).episodes"
 
 
 def main() -> None:
@@ -26,7 +28,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for count in EPISODES:
             run = make(Path(folder) / f"episodes{count}", count)
-            _row(writer, "report", "episodes of one run", count, [run])
+            for command in ("read", "report"):
+                _row(writer, command, "episodes of one run", count, [run])
         runs = [make(Path(folder) / f"run{index}", 500, seed=index) for index in range(max(RUNS))]
         for count in RUNS:
             for command in ("plot", "compare"):
@@ -61,9 +64,12 @@ def make(path: Path, episodes: int, seed: int = 0) -> Path:
 def _row(writer, command: str, what: str, count: int, runs: list[Path]) -> None:
     """Runs the command in a process of its own and writes what it took."""
     size = sum(path.stat().st_size for run in runs for path in run.glob("*.jsonl"))
-    out = runs[0].parent / {"plot": "a.png", "compare": "a.csv", "report": "a.html"}[command]
-    words = [sys.executable, "-m", "vecpsmbpo.cli", command, *map(str, runs), f"out={out}"]
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+    if command == "read":
+        words = ["-c", READ, str(runs[0])]
+    else:
+        out = runs[0].parent / {"plot": "a.png", "compare": "a.csv", "report": "a.html"}[command]
+        words = ["-m", "vecpsmbpo.cli", command, *map(str, runs), f"out={out}"]
+    process = subprocess.Popen([sys.executable, *words], stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
     if status:
         sys.exit(f"{command} failed")

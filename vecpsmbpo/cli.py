@@ -30,6 +30,7 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo render runs/x out=walk.mp4              its best member at work; member=all: all of them
   vecpsmbpo export runs/x out=policy/               its best policy as files that need nothing of this
   vecpsmbpo figure fig9 size=cpu out=fig9.png       a figure of the paper, from the runs of its experiment
+  vecpsmbpo figure fig9 runs/x out=weights.png      figure 9's picture, who was likely to act, of any run
   vecpsmbpo envs                                    tasks, backends, sizes
   vecpsmbpo theory                                  the paper's theory in numbers, in seconds
   vecpsmbpo --version                               of this program, jax, mujoco and Python

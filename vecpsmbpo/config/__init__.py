@@ -1,7 +1,7 @@
 """From a command line, a keyword call or a run directory to `Settings`: every mistake becomes one line."""
 
 from vecpsmbpo.config.choices import GROUPS, closest, env_options, options
-from vecpsmbpo.config.composing import compose, for_hydra, from_tree, hydra_errors
+from vecpsmbpo.config.composing import compose, compose_point, for_hydra, from_tree, hydra_errors
 from vecpsmbpo.config.evaluation import EVALUATION, for_evaluation, parse_evaluation
 from vecpsmbpo.config.overrides import parse
 from vecpsmbpo.config.resuming import resolve
@@ -15,6 +15,7 @@ __all__ = [
     "as_override",
     "closest",
     "compose",
+    "compose_point",
     "env_options",
     "for_evaluation",
     "for_hydra",

@@ -32,6 +32,15 @@ def compose(overrides: Sequence[str]) -> Settings:
     """
     given = parse(overrides)
     check_algorithm(given.get("algo", default("algo")), given)
+    return _compose(overrides)
+
+
+def compose_point(experiment: str, overrides: Sequence[str]) -> Settings:
+    """The settings of one run of an experiment, which is a grid of them; `overrides` say which."""
+    return _compose([f"experiment={experiment}", *overrides])
+
+
+def _compose(overrides: Sequence[str]) -> Settings:
     with hydra_errors(), hydra.initialize_config_module("vecpsmbpo.configs", version_base="1.3"):
         tree = hydra.compose("config", for_hydra(overrides))
     return from_tree(tree, overrides)

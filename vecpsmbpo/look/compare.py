@@ -87,6 +87,8 @@ def run(words: Sequence[str]) -> int:
         files.check_writable(options["out"])
     found = runs.load_all(paths)
     rows = table(found, options)
+    if all(np.isnan(row.cells["final"].value) for row in rows):
+        raise SettingError(f"y={options['y']}: is null in every line of the runs up to step {rows[0].env_steps:,}")
     for text in runs.warnings(found):
         print(f"vecpsmbpo: warning: {text}", file=sys.stderr)
     if options["out"]:
@@ -104,7 +106,8 @@ def table(found: Sequence[Run], options: dict[str, Any]) -> list[Row]:
     Every group is taken to the same step of a task: the last that all its unfrozen lanes have reached.
 
     Raises:
-        SettingError: as `groups.group`; a column is not there; `baseline` is no group; `steps` were not reached.
+        SettingError: as `groups.group`; a column is not there; `baseline` is no group; `steps` were not reached;
+            `floor` is not below `target`.
     """
     check_columns(found, "y", [options["y"]])
     together = groups.group(found, options["group"])
@@ -144,7 +147,7 @@ def _common_steps(here: Sequence[Group], asked: int) -> int:
 def score(lane: Lane, steps: int, options: dict[str, Any]) -> Seed:
     """A lane's scores up to `steps`. A frozen one keeps the value that it had reached."""
     at, values = lane.epochs["env_steps"], lane.epochs[options["y"]]
-    kept = (at <= steps) & np.isfinite(values)
+    kept = (at <= steps) & runs.known(values)
     at, values = at[kept], values[kept]
     if not len(values):
         return Seed(NAN, NAN, NAN, NAN, NAN)
@@ -164,11 +167,22 @@ def score(lane: Lane, steps: int, options: dict[str, Any]) -> Seed:
 
 
 def _scale(lane: Lane, options: dict[str, Any]) -> tuple[float, float] | None:
-    """Returns that count as 0 and 1 (`published.scale`), unless the command line says otherwise."""
+    """Returns that count as 0 and 1 (`published.scale`), unless the command line says otherwise.
+
+    Raises:
+        SettingError: what it says leaves no scale.
+    """
     low, high = published.scale(lane.run.settings) or (0.0, NAN)
-    low = low if options["floor"] is None else options["floor"]
-    high = high if options["target"] is None else options["target"]
-    return (low, high) if high > low else None
+    given = {name: options[name] for name in ("floor", "target") if options[name] is not None}
+    low, high = given.get("floor", low), given.get("target", high)
+    if high > low:
+        return low, high
+    if given:
+        said, task = " ".join(f"{name}={value:g}" for name, value in given.items()), lane.run.settings.task
+        if np.isnan(high):
+            raise SettingError(f"{said}: needs target=, too: what is to be reached on {task} is not known")
+        raise SettingError(f"{said}: what counts as 0 on {task} ({low:g}) must be below what counts as 1 ({high:g})")
+    return None
 
 
 def _cells(scores: dict[str, list[Seed]], base: dict[str, list[Seed]] | None, scales: dict) -> dict[str, Estimate]:
@@ -277,6 +291,8 @@ def caption(rows: Sequence[Row], options: dict[str, Any]) -> str:
         parts.append(f"P(better): that a run's final score is above one of {base} (baseline=).")
     if options["threshold"] is not None:
         parts.append(f"steps to: {options['threshold']:g} (threshold=), median over seeds.")
+    if any("seconds" in row.cells for row in rows):
+        parts.append("seconds: wall time of the program that a seed was in, with all other seeds in it; median.")
     if any(row.frozen for row in rows):
         parts.append("A frozen seed counts as what it had reached.")
     return " ".join(parts)

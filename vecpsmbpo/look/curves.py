@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vecpsmbpo import logged
 from vecpsmbpo.config import closest
 from vecpsmbpo.look import statistics
 from vecpsmbpo.look.groups import Group
-from vecpsmbpo.look.runs import Lane, Run
+from vecpsmbpo.look.runs import Lane, Run, known
 from vecpsmbpo.settings import SettingError
 
 Array = np.ndarray
@@ -56,6 +57,20 @@ def check_columns(runs: Sequence[Run], option: str, names: Iterable[str]) -> Non
     for name in names:
         if name not in known:
             raise SettingError(f"{option}={name}: the runs have no such column; {closest(name, known)}")
+
+
+def axis_label(name: str, runs: Iterable[Run]) -> str:
+    """What an axis calls a column of the runs.
+
+    Returns in training are of the episodes that are learned from: where these are shorter than evaluations (the setting
+    `train_episode_length`), it says how long.
+    """
+    label, every = logged.of(name).label, [run.settings for run in runs]
+    shorter = any(settings.train_episode_length not in (0, settings.episode_length) for settings in every)
+    if name != "train_return" or not shorter:
+        return label
+    lengths = sorted({settings.training_limit for settings in every} - {0})
+    return f"{label} (episodes of {' or '.join(f'{steps:,}' for steps in lengths)} steps)"
 
 
 def bootstrap_band(seeds: Array, average: str = "mean") -> tuple[Array, Array]:
@@ -121,7 +136,7 @@ def _line(lane: Lane, x: str, y: str, smooth: int) -> tuple[Array, Array]:
     """Where a lane has a value, and the value."""
     nothing = np.full(len(lane.epochs["env_steps"]), np.nan)
     at, values = lane.epochs.get(x, nothing), lane.epochs.get(y, nothing)
-    there = np.isfinite(at) & np.isfinite(values)
+    there = known(at) & known(values)
     at, values = at[there], values[there]
     sums = np.cumsum(np.concatenate([[0.0], values]))
     ends = np.arange(1, len(values) + 1)

@@ -1,7 +1,7 @@
 """Which lanes belong together, and what a group is called: by what differs between them."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,15 @@ def label(name: str, value: Any) -> str:
     if name in ("algo", "real_ratio_schedule", RUN):
         return shown
     return f"{symbol} {shown}" if symbol and isinstance(value, str) else f"{symbol or name} = {shown}"
+
+
+def averaged(groups: Iterable[Group], average: str, band: str) -> str:
+    """What the curves of groups are: `mean of 3 to 5 seeds, 95% bootstrap band`; one seed has no band."""
+    seeds = {len(one.lanes) for one in groups}
+    if max(seeds) == 1:
+        return "one seed"
+    of = f"{min(seeds)} to {max(seeds)}" if len(seeds) > 1 else f"{max(seeds)}"
+    return f"{average} {of} seeds, {band}"
 
 
 def common_task(runs: Sequence[Run]) -> str:

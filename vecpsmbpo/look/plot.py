@@ -9,7 +9,7 @@ from typing import Any
 
 from vecpsmbpo import arguments, logged
 from vecpsmbpo.look import files, groups, published, runs
-from vecpsmbpo.look.curves import AVERAGES, Curve, check_columns, curve
+from vecpsmbpo.look.curves import AVERAGES, Curve, axis_label, check_columns, curve
 from vecpsmbpo.settings import SettingError
 
 OPTIONS = {
@@ -17,7 +17,7 @@ OPTIONS = {
     "y": arguments.names("columns of metrics.jsonl, a panel each", "eval_return"),
     "group": arguments.names("settings whose values make a curve each; without it, those that differ between the runs"),
     "average": arguments.choice("over the seeds of a curve, with its bootstrap interval", *AVERAGES),
-    "smooth": arguments.whole("epochs that a moving average spans", 1, at_least=1),
+    "smooth": arguments.whole("epochs that a moving average spans", 1, at_least=1, at_most=1_000_000),
     "reference": arguments.names(
         "published curves to draw beside them", allowed=f"of {', '.join(published.REFERENCES)}, separated by commas"
     ),
@@ -25,6 +25,7 @@ OPTIONS = {
     "out": arguments.out("the picture, or its numbers", "curves.png", ".png", ".svg", ".pdf", ".csv"),
 }
 COLUMNS = 3  # panels in a row
+BEYOND = 1.0  # how many heights of a panel's curves a published level may lie above them and still be drawn
 
 
 def run(words: Sequence[str]) -> int:
@@ -56,8 +57,7 @@ def draw(found: list[runs.Run], options: dict[str, Any]) -> None:
         SettingError: the runs are of different tasks or lack what is to be drawn, or the file cannot be written.
     """
     task = groups.common_task(found)
-    lookup = {"mbpo": published.mbpo, "sac": published.asymptote}
-    references = {name: lookup[name](task) for name in options["reference"]}
+    references = [published.reference(name, task) for name in options["reference"]]
     check_columns(found, "y", options["y"])
     check_columns(found, "x", [options["x"]])
     together = groups.group(found, options["group"])
@@ -79,17 +79,15 @@ def draw(found: list[runs.Run], options: dict[str, Any]) -> None:
             if len(curves) == 1:  # several groups of seeds would be a thicket
                 style.threads(axis, looks[curves[0].name], curves[0].x, curves[0].seeds)
             draw_curves(axis, curves, looks)
-            axis.set_ylabel(logged.of(y).label)
+            # What is in brackets stands below, or a label is longer than its axis.
+            axis.set_ylabel(style.literal(axis_label(y, found).replace(" (", "\n(")))
             style.steps_axis(axis, logged.of(options["x"]).label)
             if y == "eval_return":
                 draw_references(axis, references)
         average = {"mean": "mean", "iqm": "interquartile mean"}[options["average"]]
-        seeds = {len(one.lanes) for one in together}
-        of = f"{min(seeds)} to {max(seeds)}" if len(seeds) > 1 else f"{max(seeds)}"
-        note = f"{average} of {of} seeds, 95% bootstrap band" if max(seeds) > 1 else "one seed"
-        figure.suptitle(options["title"] or f"{task}: {note}", x=0.01, ha="left", fontsize=10)
-        most = max(axes, key=lambda axis: len(axis.get_legend_handles_labels()[1]))
-        style.legend(figure, most)
+        note = groups.averaged(together, f"{average} of", "95% bootstrap band")
+        style.title(figure, options["title"] or f"{task}: {note}")
+        style.legend(figure, axes)
         style.save(figure, options["out"])
 
 
@@ -107,17 +105,24 @@ def draw_curves(axis: Any, curves: Iterable[Curve], looks: Mapping[str, Any]) ->
         style.line(axis, looks[line.name], line.x, line.y, low=line.low, high=line.high, label=line.name)
 
 
-def draw_references(axis: Any, references: Mapping[str, Any]) -> None:
-    """Published curves (`published`), in grey: they are of other code, on other machines."""
-    grey = {"color": "#656d76", "lw": 1.3}
-    for name, found in references.items():
-        if name == "sac":
-            axis.axhline(found, ls=(0, (1, 1.5)), label="SAC at 3M steps", **grey)
+def draw_references(axis: Any, references: Iterable[published.Published | published.Level]) -> None:
+    """What others have published, beside curves that are there already; in grey, as it is of other code."""
+    from vecpsmbpo.look import style
+
+    grey: dict[str, Any] = {"color": style.FAINT, "lw": 1.3}
+    for one in references:
+        if isinstance(one, published.Published):
+            marks: dict[str, Any] = {"marker": "o", "mfc": "white", "ms": 4, "capsize": 2}
+            axis.errorbar(one.steps, one.mean, one.deviation, ls="--", label=one.name, **marks, **grey)
             continue
-        marks = {"marker": "o", "mfc": "white", "ms": 4, "capsize": 2}
-        axis.errorbar(
-            found.steps, found.mean, found.deviation, ls="--", label=f"{found.name} (± s.d.)", **marks, **grey
-        )
+        bottom, top = axis.get_ylim()
+        if one.high > top + BEYOND * (top - bottom):  # drawn, it would flatten the curves
+            soft: dict[str, Any] = {"color": style.FAINT, "fontsize": 8, "fontweight": "normal"}
+            axis.set_title(f"{one.name}: {one.value} ↑", loc="right", **soft)
+        elif one.low < one.high:
+            axis.axhspan(one.low, one.high, color=style.FAINT, alpha=0.13, lw=0, label=f"{one.name} steps")
+        else:
+            axis.axhline(one.low, ls=(0, (1, 1.5)), label=f"{one.name} steps", **grey)
 
 
 def write_csv(path: Path, found: Sequence[runs.Run], names: Sequence[str]) -> None:
