@@ -8,7 +8,7 @@ import numpy as np
 from vecpsmbpo.config import closest
 from vecpsmbpo.look import statistics
 from vecpsmbpo.look.groups import Group
-from vecpsmbpo.look.runs import Lane, Run
+from vecpsmbpo.look.runs import Columns, Lane, Run
 from vecpsmbpo.settings import SettingError
 
 Array = np.ndarray
@@ -117,10 +117,15 @@ def joined(
     return Curve(group.name, grid, AVERAGES[average](seeds, axis=0), low, high, seeds)
 
 
+def numbers(epochs: Columns, name: str) -> Array:
+    """A column [T]; NaN where the log has none, or one of texts or lists."""
+    column = epochs.get(name)
+    return np.full(len(epochs["env_steps"]), np.nan) if column is None or column.ndim > 1 else column
+
+
 def _line(lane: Lane, x: str, y: str, smooth: int) -> tuple[Array, Array]:
     """Where a lane has a value, and the value."""
-    nothing = np.full(len(lane.epochs["env_steps"]), np.nan)
-    at, values = lane.epochs.get(x, nothing), lane.epochs.get(y, nothing)
+    at, values = numbers(lane.epochs, x), numbers(lane.epochs, y)
     there = np.isfinite(at) & np.isfinite(values)
     at, values = at[there], values[there]
     sums = np.cumsum(np.concatenate([[0.0], values]))

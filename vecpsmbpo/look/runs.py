@@ -93,7 +93,7 @@ class Run:
     @cached_property
     def episodes(self) -> Columns:
         """Columns of episodes.jsonl of all lanes, [E] each; `probs` [E, N·M]."""
-        return read(self.path / EPISODES_FILE).columns
+        return read(self.path / EPISODES_FILE, needed=("env_steps", *self.settings.lanes[0])).columns
 
     def of_lane(self, values: Mapping[str, float]) -> Columns:
         """`episodes` of the lane with this seed and these swept values."""
