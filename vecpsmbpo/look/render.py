@@ -44,6 +44,7 @@ OPTIONS = {
 FRAMES_PER_S = 30
 STRIP = 4  # frames of a .png, as in figure 8
 SINGLE, TILE, SHEET = 480, 240, 1920  # pixels: the width of one picture, of each of several, and of all together
+NARROW = 170  # pixels: where step and return have no room beside each other
 ENDED = 0.45  # brightness of a tile whose episode is over
 PLATFORMS = ("egl", "osmesa")
 OWN = "episode"  # the film that a run with a page, or a logger that takes films, makes of itself at its end
@@ -284,11 +285,12 @@ def mosaic(tiles: Sequence[Tile], columns: int) -> Array:
     rows = -(-len(tiles) // columns)
     # Even sizes: the video's colours are stored at half resolution.
     sheet = Image.new("RGB", (columns * width + columns * width % 2, rows * height + rows * height % 2))
+    apart = "   " if width > NARROW else "\n"
     look: dict[str, Any] = {"fill": "white", "stroke_width": 2, "stroke_fill": "black", "font_size": 13}
     for index, tile in enumerate(tiles):
         picture = (tile.picture * (ENDED if tile.over and len(tiles) > 1 else 1.0)).astype(np.uint8)
         image = Image.fromarray(picture)
-        text = f"{tile.name}\nstep {tile.step:,}   return {tile.earned:,.0f}"
+        text = f"{tile.name}\nstep {tile.step:,}{apart}return {tile.earned:,.0f}"
         ImageDraw.Draw(image).multiline_text((6, 4), text, **look)
         sheet.paste(image, (index % columns * width, index // columns * height))
     return np.asarray(sheet)
