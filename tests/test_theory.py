@@ -336,6 +336,18 @@ def test_a_directory_that_cannot_be_written(tmp_path):
         report.run([f"out={tmp_path}/file/theory"])
 
 
+def test_what_was_there_stays_where_the_disk_is_full(tmp_path, monkeypatch, capsys):
+    def full(path, text, **kwargs):
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(tmp_path), "write_text", full)
+    (tmp_path / "theory.csv").write_bytes(b"before")
+    with pytest.raises(SettingError, match=r"theory.csv: cannot be written \(No space left on device\)"):
+        report.run([f"out={tmp_path}", "episodes=2", "runs=2"])
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"theory.csv": b"before"}
+
+
 def test_the_theory_does_not_import_jax():
     code = "import sys, vecpsmbpo.theory.report; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

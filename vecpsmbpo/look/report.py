@@ -38,9 +38,10 @@ def run(words: Sequence[str]) -> int:
     paths = arguments.run_dirs("report", named)
     files.check_writable(options["out"])
     named_films = [_film(name) for name in options["videos"]]
+    found = runs.load_all(paths)
+    for run in found:
+        _ = run.episodes  # read now, since that shows its own progress
     with Working() as working:
-        working.on("reading runs")
-        found = runs.load_all(paths)
         measured = found if options["diagnostics"] == "true" else []
         diagnoses = {run.path: diagnose.measure(run, working=working) for run in measured}
         write(

@@ -1,10 +1,11 @@
 """Runs as they lie on disk, also damaged ones and ones that are being written.
 
 Logs are read as columns, a batch of lines at a time: time and memory grow with the number of lines, and a million
-episodes are some arrays and not a million dictionaries.
+episodes are some arrays and not a million dictionaries. Commands that somebody waits for show how far reading has come
+(`load_all`, `load_each`).
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +15,13 @@ import numpy as np
 
 from vecpsmbpo import config, jsonl
 from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE
+from vecpsmbpo.look import waiting
 from vecpsmbpo.settings import SettingError, Settings
 
 Array = np.ndarray
 Columns = dict[str, Array]
+
+LARGEST = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -70,11 +74,18 @@ class Lane:
 
 @dataclass(frozen=True)
 class Run:
-    """A run directory."""
+    """A run directory.
+
+    Attributes:
+        path, settings: of the run.
+        metrics: metrics.jsonl.
+        watched: whether somebody waits for it: reading its episodes shows how far it has come.
+    """
 
     path: Path
     settings: Settings
     metrics: Log
+    watched: bool = False
 
     @cached_property
     def lanes(self) -> list[Lane]:
@@ -93,7 +104,9 @@ class Run:
     @cached_property
     def episodes(self) -> Columns:
         """Columns of episodes.jsonl of all lanes, [E] each; `probs` [E, N·M]."""
-        return read(self.path / EPISODES_FILE, needed=("env_steps", *self.settings.lanes[0])).columns
+        path = self.path / EPISODES_FILE
+        with waiting.reading([path] if self.watched else []) as advance:
+            return read(path, needed=("env_steps", *self.settings.lanes[0]), advance=advance).columns
 
     def of_lane(self, values: Mapping[str, float]) -> Columns:
         """`episodes` of the lane with this seed and these swept values."""
@@ -116,17 +129,31 @@ class Run:
         return self.path.resolve().name
 
 
-def load(path: Path) -> Run:
+def load(path: Path, advance: Callable[[int], object] | None = None) -> Run:
     """The run in a directory.
+
+    Args:
+        advance: as in `read`; with it, the run is one that somebody waits for.
 
     Raises:
         SettingError: there is none, or it cannot be read (`config.load`).
     """
     settings = config.load(path)
     try:
-        return Run(path, settings, read(path / METRICS_FILE, needed=("env_steps", *settings.lanes[0])))
+        metrics = read(path / METRICS_FILE, needed=("env_steps", *settings.lanes[0]), advance=advance)
     except OSError as error:
         raise SettingError(f"run_dir={path}: cannot be read ({error.strerror})") from None
+    return Run(path, settings, metrics, watched=advance is not None)
+
+
+def load_each(paths: Sequence[Path]) -> list[Run]:
+    """The runs in directories, for a command: a terminal shows how far reading them has come.
+
+    Raises:
+        SettingError: as `load`.
+    """
+    with waiting.reading(path / METRICS_FILE for path in paths) as advance:
+        return [load(path, advance) for path in paths]
 
 
 def kept_steps(run: Run) -> list[int]:
@@ -143,12 +170,12 @@ def check_lane(run: Run, lane: int) -> None:
 
 
 def load_all(paths: Iterable[Path]) -> list[Run]:
-    """The runs in directories, each with an epoch to show.
+    """As `load_each`, each with an epoch to show.
 
     Raises:
         SettingError: as `load`; or a run has not finished an epoch.
     """
-    runs = [load(path) for path in paths]
+    runs = load_each(list(paths))
     for run in runs:
         if not len(run.metrics):
             raise SettingError(f"run_dir={run.path}: has no whole epoch in {METRICS_FILE} yet")
@@ -167,14 +194,28 @@ def warnings(runs: Iterable[Run]) -> Iterator[str]:
                 yield f"{run.path}: {lane.name} was frozen at step {lane.epochs['env_steps'][-1]:.0f}"
 
 
-def read(path: Path, needed: Iterable[str] = ("env_steps", "seed")) -> Log:
-    """A JSONL file as columns; empty where there is no file. Lines without the `needed` numbers count as damaged."""
+def known(values: Array) -> Array:
+    """Which values a run can have had, which computes in float32. Sums and squares of these are finite."""
+    return np.abs(values) <= LARGEST  # False for NaN
+
+
+def read(
+    path: Path, needed: Iterable[str] = ("env_steps", "seed"), *, advance: Callable[[int], object] | None = None
+) -> Log:
+    """A JSONL file as columns; empty where there is no file.
+
+    Args:
+        needed: lines without these numbers count as damaged.
+        advance: is told, again and again, how many more bytes have been read.
+    """
     if not path.exists():
         return Log({}, 0)
     damaged = 0
     parts: list[Columns] = []
     with path.open("rb") as file:
         for batch in jsonl.batches(file, needed):
+            if advance:
+                advance(sum(len(text) for text, _ in batch))
             lines = [line for _, line in batch if line is not None]
             damaged += len(batch) - len(lines)
             if lines:

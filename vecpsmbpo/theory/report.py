@@ -1,6 +1,7 @@
 """`vecpsmbpo theory`: computes what this package holds; prints tables, writes a CSV file and a figure."""
 
 import csv
+import io
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -8,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
 from vecpsmbpo import arguments
+from vecpsmbpo.look import files, waiting
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.theory import example, tabular
 from vecpsmbpo.theory.tabular import Belief, Estimate
@@ -118,16 +119,14 @@ def run(words: Sequence[str]) -> int:
     options = Options(**values)
     folder = options.out
     console = Console(highlight=False, width=118)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        console.print(_example_table(), "", _lambda_table(), "", sep="\n")
-        experiment = compute(options)
-        console.print(_arms_table(experiment, options), "", _best_table(experiment), "", sep="\n")
-        console.print(_notes(experiment, options), markup=False)
-        _write_csv(folder / "theory.csv", experiment)
-        _draw(folder / "theory.svg", experiment)
-    except OSError as error:
-        raise SettingError(f"out={options.out}: cannot be written ({error.strerror})") from None
+    for name in ("theory.csv", "theory.svg"):
+        files.check_writable(folder / name)
+    console.print(_example_table(), "", _lambda_table(), "", sep="\n")
+    experiment = compute(options)
+    console.print(_arms_table(experiment, options), "", _best_table(experiment), "", sep="\n")
+    console.print(_notes(experiment, options), markup=False)
+    files.write_text(folder / "theory.csv", _as_csv(experiment))
+    _draw(folder / "theory.svg", experiment)
     console.print(f"written: {folder / 'theory.csv'}, {folder / 'theory.svg'}", markup=False)
     return 0
 
@@ -140,8 +139,7 @@ def compute(options: Options) -> Experiment:
     tasks: list[tuple[Belief, float]] = [(belief, ratio) for belief in beliefs for ratio in REAL_RATIOS[:-1]]
     tasks.append((tabular.EXACT, 1.0))
     data, arms = None, []
-    progress = Console(stderr=True)
-    for belief, ratio in track(tasks, "PSRL", console=progress, transient=True, disable=not progress.is_terminal):
+    for belief, ratio in waiting.steps(tasks, "PSRL"):
         outcome = tabular.psrl(world, belief, ratio, truth)
         arms.append(Arm.of(belief.name, ratio, outcome))
         data = outcome.counts if data is None else data  # the first task is exact PSRL
@@ -280,12 +278,13 @@ def _draw(path: Path, experiment: Experiment) -> None:
     write(path, "The theory of posterior sampling", panels, columns=3)
 
 
-def _write_csv(path: Path, experiment: Experiment) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(("part", "case", "real_ratio", "episode", "quantity", "value", "standard_error"))
-        for *labels, value, error in _lines(experiment):
-            writer.writerow((*labels, f"{value:.6g}", "" if error is None else f"{error:.6g}"))
+def _as_csv(experiment: Experiment) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("part", "case", "real_ratio", "episode", "quantity", "value", "standard_error"))
+    for *labels, value, error in _lines(experiment):
+        writer.writerow((*labels, f"{value:.6g}", "" if error is None else f"{error:.6g}"))
+    return text.getvalue()
 
 
 def _lines(experiment: Experiment) -> Iterator[tuple]:
