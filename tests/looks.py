@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vecpsmbpo import config
-from vecpsmbpo.look import compare
+from vecpsmbpo.look import compare, diagnostics
 from vecpsmbpo.settings import Settings
 
 
@@ -56,6 +56,47 @@ def episodes(count: int, members: tuple[int, int] = (2, 2), seed: int = 0, lengt
         }
         for index in range(count)
     ]
+
+
+def diagnosis(checkpoints: int = 1, *, n_models: int = 2, horizon: int = 4, obs_size: int = 2) -> dict[str, Any]:
+    """What `diagnose` writes of a run: errors of 0.2 where 0.1 was expected."""
+    sizes = (n_models, horizon, obs_size + 1)
+    errors = {"error": np.full(sizes, 0.2), "expected": np.full(sizes, 0.1), "no_change": np.ones(sizes[1:])}
+    errors["disagreement"] = np.full(sizes[1:], 0.05)
+    critics = {"q": 2.0, "earned": 1.5, "bias": 0.5, "spread_of_bias": 0.1}
+    return diagnostics.finite(
+        {
+            "task": "cartpole_swingup",
+            "lane": {"seed": 0},
+            "episodes": 1,
+            "env_steps": 120,
+            "models": {
+                "dimensions": ["obs 0", "obs 1", "reward"],
+                "spread": np.ones(obs_size + 1),
+                **errors,
+                "relative": {name: values[..., 0] for name, values in errors.items()},
+                "levels": (0.5, 0.9),
+                "coverage": np.full((n_models, 2, obs_size + 1), 0.7),
+                "histogram": np.ones((n_models, 5)),
+            },
+            "critics": {
+                "members": ["0,0", "1,0"],
+                "states": 2,
+                "discount": 0.99,
+                **critics,
+                "shown": {"member": [0, 1], "q": [1.0, 2.0], "earned": [1.0, 2.0]},
+            },
+            "states": {
+                "method": "UMAP",
+                "real": [[0.0, 1.0]],
+                "imagined": [[1.0, 0.0]],
+                "distance": {"imagined": 0.1, "fresh": 0.2},
+            },
+            "history": [
+                {"env_steps": 40 * index, "critics": critics, "errors": [0.2, 0.2]} for index in range(checkpoints)
+            ],
+        }
+    )
 
 
 @functools.cache

@@ -130,3 +130,44 @@ class FailingGymnasium(gymnasium.Env):
         fails = self.steps % 7 == 0
         obs = np.array([1e39 if fails and action[0] > 0 else self.obs])  # infinite in float32
         return obs, -np.inf if fails and action[0] <= 0 else reward, False, False, {}
+
+
+# ── that draws itself, and is no MuJoCo task ────────────────────────────────────────────────────────────────────
+
+
+class Lamp(gymnasium.Env):
+    """Lighter by the action's size at every step, until it is white."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+    observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, render_mode=None):
+        self.render_mode, self.light = render_mode, 0.0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.light = 0.0
+        return np.array([self.light], np.float32), {}
+
+    def step(self, action):
+        self.light = min(self.light + abs(float(action[0])) / 10, 1.0)
+        return np.array([self.light], np.float32), 1.0, False, False, {}
+
+    def render(self):
+        return np.full((60, 80, 3), round(255 * self.light), np.uint8)
+
+
+class Blind(Lamp):
+    """Takes no render mode."""
+
+    def __init__(self):
+        super().__init__()
+
+
+def drawn_lamp() -> Lamp:
+    return Lamp(render_mode="rgb_array")
+
+
+gymnasium.register("Lamp-v0", entry_point="tests.probes:Lamp", max_episode_steps=30)
+gymnasium.register("Blind-v0", entry_point="tests.probes:Blind")

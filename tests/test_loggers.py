@@ -6,14 +6,17 @@ import os
 import struct
 import threading
 import time
+import types
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from tensorboardX import record_writer
 
 from tests.helpers import command, tiny
 from vecpsmbpo import cli, config, loggers, metrics
 from vecpsmbpo.settings import SettingError
+from vecpsmbpo.training import loop
 
 
 class Recorder:
@@ -67,6 +70,42 @@ def test_a_logger_is_told_every_number_on_a_thread_of_its_own(tmp_path, recorder
     ]
     assert (made.sent, made.closed) == (["walk.gif"], True)
     assert made.threads.isdisjoint({threading.main_thread()})
+
+
+@pytest.mark.parametrize(
+    ("given", "step", "filmed"),
+    [
+        ({"loggers": ("wandb",)}, 120, True),
+        ({"loggers": ("tensorboard", "mlflow")}, 120, True),
+        ({"loggers": ("tensorboard",)}, 120, False),  # which takes none
+        ({"loggers": ()}, 120, False),
+        ({"loggers": (), "report": True}, 120, True),
+        ({"loggers": ("wandb",)}, 80, False),  # it goes on
+        ({"loggers": ("wandb",), "algo": "pets"}, 120, False),  # it has no policy
+    ],
+)
+def test_who_takes_films_gets_one_of_a_run_that_is_complete(given, step, filmed, tmp_path, recorder, monkeypatch):
+    """Made before loggers are closed, which is when they are sent what lies there."""
+    monkeypatch.setattr(loop.render, "keep", lambda run_dir, warn: (run_dir / "episode.gif").write_bytes(b"GIF89a"))
+    monkeypatch.setattr(loop.report, "keep", lambda run_dir, warn: (run_dir / "report.html").write_text("a page"))
+    settings = dataclasses.replace(tiny(algo=given.pop("algo", "ops_mbpo")), **given)
+    said = types.SimpleNamespace(say=lambda text: None)
+    session = types.SimpleNamespace(settings=settings, env_steps=step, run_dir=tmp_path, display=said)
+    loop._Session._film(session)
+    assert (tmp_path / "episode.gif").exists() == filmed
+    assert (tmp_path / "report.html").exists() == settings.report
+    if settings.loggers == ("wandb",):
+        metrics.RunLog(tmp_path, 0, settings, warn=pytest.fail).close()
+        assert recorder.made[0].sent == (["episode.gif"] if filmed else [])
+
+
+def test_a_film_that_cannot_be_made_is_said(tmp_path):
+    """A run directory without a run: the line of the command is the reason."""
+    said = []
+    loop.render.keep(tmp_path, said.append)
+    (line,) = said
+    assert line.startswith(f"{tmp_path}/episode.")
+    assert line.endswith(f"is not made (run_dir={tmp_path}: holds no config.yaml, so no run)")
 
 
 def test_a_resumed_session_is_the_same_run_and_says_nothing_twice(tmp_path, recorder):
@@ -221,6 +260,7 @@ def _two_sessions(name, folder, monkeypatch):
     run_dir = folder / "run"
     run_dir.mkdir()
     (run_dir / "report.html").write_text("<p>a page</p>")
+    Image.new("RGB", (8, 8)).save(run_dir / "episode.gif")
     for begins, steps in ((0, (10, 20, 30)), (20, (30, 40))):
         log = metrics.RunLog(run_dir, begins, _settings(name), warn=pytest.fail)
         log.metrics([_line(step) for step in steps])
@@ -274,7 +314,8 @@ def test_weights_and_biases_offline(tmp_path, monkeypatch):
             files |= {item.path for item in record.files.files}
     assert history == {10: 1, 20: 2, 30: 3, 40: 4}
     assert json.loads(hyperparameters["n_models"]) == 2
-    assert any("report" in path for path in files)
+    for name, suffix in (("report", ".html"), ("episode", ".gif")):
+        assert any(Path(path).name.startswith(name) and path.endswith(suffix) for path in files)
 
 
 def test_mlflow_in_a_file(tmp_path, monkeypatch):
@@ -292,7 +333,7 @@ def test_mlflow_in_a_file(tmp_path, monkeypatch):
     assert run.data.params["n_models"] == "2"
     history = client.get_metric_history(run.info.run_id, "epoch/return/seed0")
     assert [(point.step, point.value) for point in history] == [(10, 1), (20, 2), (30, 3), (40, 4)]
-    assert [item.path for item in client.list_artifacts(run.info.run_id)] == ["report.html"]
+    assert {item.path for item in client.list_artifacts(run.info.run_id)} == {"episode.gif", "report.html"}
 
 
 def test_a_server_that_is_not_there_does_not_stop_a_run(tmp_path):

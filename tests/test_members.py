@@ -9,6 +9,7 @@ import types
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -18,7 +19,7 @@ from tests import looks
 from tests.drawing import draws
 from tests.helpers import command
 from vecpsmbpo import cli, config, envs, metrics, training
-from vecpsmbpo.look import diagnose, export, members, render, runs, states
+from vecpsmbpo.look import diagnose, export, files, members, render, runs, states
 from vecpsmbpo.settings import SettingError
 
 
@@ -38,6 +39,14 @@ def test_a_run_with_report_true_has_its_page(trained):
     assert "step 80 of 80" in text
     assert "Who acted" in text
     assert "http-equiv" not in text  # it is complete: nobody needs to look again
+
+
+@draws
+def test_a_run_with_report_true_films_an_episode_at_its_end(trained):
+    film = next(trained.glob("episode.*"))
+    assert film.suffix == (".mp4" if render._makes_mp4() else ".gif")
+    assert film.stat().st_size > 1000
+    assert "<figcaption>episode</figcaption>" in (trained / "report.html").read_text()
 
 
 # ── policies ──────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -79,6 +88,32 @@ def test_an_exported_policy_acts_the_same_without_this_package(trained, tmp_path
     before = (out / "policy.npz").read_bytes()
     assert cli.main(["export", str(trained), f"out={out}", f"member={about['member']}"]) == 0
     assert (out / "policy.npz").read_bytes() == before
+
+
+def test_an_export_that_fails_midway_leaves_the_policy_that_was_there(trained, tmp_path, monkeypatch, capsys):
+    """Also one that was written with more files than the next."""
+    out = tmp_path / "policy"
+    monkeypatch.setitem(export.ADDITIONS, "onnx", ())
+    monkeypatch.setattr(export, "onnx_model", lambda layers: b"a graph")
+    assert cli.main(["export", str(trained), "member=0,0", "also=onnx", f"out={out}"]) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert set(before) == {"policy.npz", "act.py", "policy.json", "policy.onnx"}
+
+    def full(*args):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files.os, "fsync", full)
+        assert cli.main(["export", str(trained), "member=1,0", f"out={out}"]) == 2
+        assert cli.main(["export", str(trained), "member=1,0", f"out={tmp_path / 'new'}"]) == 2
+    assert (
+        capsys.readouterr().err.splitlines()[0] == f"vecpsmbpo: out={out}: cannot be written (No space left on device)"
+    )
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert not (tmp_path / "new").exists()
+
+    assert cli.main(["export", str(trained), "member=1,0", f"out={out}"]) == 0
+    assert {path.name for path in out.iterdir()} == set(before) - {"policy.onnx"}  # it was the other member's
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +271,7 @@ def test_render_draws_every_member_and_the_robot_moves(trained, tmp_path):
     assert result.returncode == 0, result.stderr
     film = Image.open(out)
     assert film.size == (160, 120)  # two rows of two, 80 by 60 each
-    assert film.n_frames == 1 + 25 // 3  # 25 steps of 0.01 s, about thirty pictures a second
+    assert film.n_frames == 1 + 25 // 3 + 1  # 25 steps of 0.01 s, about thirty pictures a second, and the end
     frames = [np.asarray(_seek(film, index).convert("RGB"), float) for index in (0, film.n_frames - 1)]
     assert frames[0].std() > 10
     for tile in (frames[1] - frames[0]).reshape(2, 60, 2, 80, 3).swapaxes(1, 2).reshape(4, -1):
@@ -259,6 +294,20 @@ def test_render_draws_a_member_at_steps_of_training(trained, tmp_path):
     assert np.abs(first[20:] - last[20:]).max() > 50  # another policy moves it elsewhere
 
 
+def test_a_policy_s_name_says_who_acts(trained):
+    """The posterior draws by equation 19 with the state's own key, as an evaluation with it does."""
+    lane = members.load(runs.load(trained), 1)
+    names = members.member_names(lane.run)
+    seed = lane.of_lane(lane.state)
+    logits = np.asarray(seed.posterior.returns, float) / lane.run.settings.temperature
+    drawn = names[int(jax.random.categorical(seed.key, logits - logits.max()))]
+    obs = np.random.default_rng(0).normal(size=(7, 5)).astype(np.float32)
+    for who, member in (("posterior", drawn), ("best", names[lane.best()])):
+        ((name, act),), ((_, own),) = members.acting(lane, who), members.acting(lane, member)
+        assert name == f"{who} {member}"
+        np.testing.assert_array_equal(act(obs), own(obs))
+
+
 @draws
 def test_render_makes_a_video(trained, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
@@ -267,7 +316,7 @@ def test_render_makes_a_video(trained, tmp_path):
     import imageio
 
     with imageio.get_reader(tmp_path / "walk.mp4") as film:
-        assert film.count_frames() == 1 + 25 // 3
+        assert film.count_frames() == 1 + 25 // 3 + 1
         assert film.get_data(0).shape == (60, 80, 3)
 
 
@@ -290,10 +339,19 @@ MISTAKES = [
     (["render", "run", "run2"], "run_dir: render takes 1 run, not 2"),
     (["render", "run", "out=walk.avi"], "out=walk.avi: must be a file that ends in .mp4, .gif, .png"),
     (["render", "run", "out=a.gif", "lane=2"], "lane=2: must be below 2"),
+    (["render", "run", "out=a.gif", "width=20000"], "width=20000: must be a whole number from 64 to 8192"),
+    (["render", "run", "out=a.gif", "seed=5000000000"], "seed=5000000000: must be a whole number from 0 to 2147483647"),
+    (["diagnose", "run", "seed=2147483648"], "seed=2147483648: must be a whole number from 0 to 2147483647"),
     (["render", "run", "out=a.gif", "member=2,0"], "member=2,0: must be best, posterior, all or one of 0,0  0,1"),
     (["export", "run", "member=2,0"], "member=2,0: must be best or one of 0,0  0,1  1,0  1,1"),
     (["export", "run", "out=file"], "out=file: must be a directory"),
-    (["export", "pets"], "run_dir=pets: only policies that learn by SAC can be exported, not algo=pets"),
+    (["export", "pets"], "run_dir=pets: algo=pets plans its actions; there is no policy to export"),
+    (
+        ["export", "slbo"],
+        "run_dir=slbo: what is exported is a network as SAC's, ReLU and a tanh at its end; the one of",
+    ),
+    (["export", "together"], "member=best: with posterior=average all members act together, which is no single policy"),
+    (["export", "broken_run"], "broken_run/checkpoints: holds checkpoints, but none that can be read ("),
     (["export", "bare"], "run_dir=bare: holds no checkpoint yet"),
     (["diagnose", "run", "run2"], "run_dir: diagnose takes 1 run, not 2"),
     (["diagnose", "run", "out=a.gif"], "out=a.gif: must be a file that ends in .json, .png, .svg, .pdf"),
@@ -305,7 +363,7 @@ MISTAKES = [
     (["render", "bare", "out=a.gif", "steps=7"], "steps=7: there is none"),
     (
         ["report", "half", "out=a.html"],
-        "half/diagnostics.json: cannot be read; vecpsmbpo diagnose half writes it again",
+        "half/diagnostics.json: cannot be read (JSONDecodeError: Expecting value: line 1 column 14 (char 13)",
     ),
     (["render", "run", "out=a.gif", "steps=41"], "steps=41: must be of 0, 40, 80, which checkpoints are kept of"),
     (["render", "run", "out=a.gif", "steps=[0,x]"], "steps=[0,x]: must be whole numbers, separated by commas"),
@@ -319,8 +377,18 @@ MISTAKES = [
 ]
 
 
+@pytest.fixture(scope="module")
+def damaged_run(trained):
+    """None of its checkpoints can be read."""
+    path = trained.parent / "damaged_run"
+    shutil.copytree(trained, path)
+    for host in (path / "checkpoints").glob("*/host/metadata"):
+        host.write_text("{")
+    return path
+
+
 @pytest.fixture
-def shelf(trained, policy, tmp_path, monkeypatch):
+def shelf(trained, policy, damaged_run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, damage in {"policy": lambda path: None, **DAMAGED}.items():
         shutil.copytree(policy, tmp_path / name)
@@ -329,6 +397,9 @@ def shelf(trained, policy, tmp_path, monkeypatch):
         (tmp_path / name).symlink_to(trained)
     (tmp_path / "file").write_text("")
     looks.write(tmp_path / "pets", looks.epochs([1]), algo="pets")
+    looks.write(tmp_path / "slbo", looks.epochs([1]), algo="slbo")
+    looks.write(tmp_path / "together", looks.epochs([1]), posterior="average")
+    (tmp_path / "broken_run").symlink_to(damaged_run)
     looks.write(tmp_path / "bare", looks.epochs([1]), backend="host")
     looks.write(tmp_path / "half", looks.epochs([1]))
     (tmp_path / "half" / "diagnostics.json").write_text('{"history": [')
@@ -360,6 +431,33 @@ def test_a_video_without_its_extra_names_it(shelf, monkeypatch, capsys):
     assert capsys.readouterr().err == (
         "vecpsmbpo: out=a.mp4: .mp4 needs imageio-ffmpeg; pip install 'vecpsmbpo[video]', or take .gif\n"
     )
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_a_film_that_is_not_told_where_goes_where_it_can_be_made(installed, shelf, monkeypatch, capsys):
+    monkeypatch.setattr(render, "_makes_mp4", lambda: installed)
+    monkeypatch.setattr(render, "platform", lambda: "egl")
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setattr(render, "film", lambda *args: ([np.zeros((4, 4, 3), np.uint8)] * 2, 0.1))
+    monkeypatch.setattr(render, "_write", lambda frames, frame_s, path: path.write_bytes(b"film"))
+    assert cli.main(["render", "run"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    name = "walk.mp4" if installed else "walk.gif"
+    assert said[-1] == f"written: {name}"
+    assert said[:-1] == (
+        [] if installed else ["a .gif, since .mp4 needs imageio-ffmpeg: pip install 'vecpsmbpo[video]'"]
+    )
+    assert (shelf / name).read_bytes() == b"film"
+
+
+def test_a_terminal_sees_what_is_diagnosed(trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(states, "has_umap", lambda: False)
+    assert cli.main(["diagnose", str(trained), "horizon=4", f"out={tmp_path / 'a.json'}"]) == 0
+    shown = capsys.readouterr().err
+    for what in ("reading checkpoints", *(f"step 80: {part}" for part in ("fresh", "models", "critics", "imagined"))):
+        assert what in shown
 
 
 def test_a_run_is_not_touched_by_being_looked_at(trained, tmp_path):

@@ -37,6 +37,7 @@ def test_every_task_runs_end_to_end_and_resumes_on_every_backend(name, backend, 
     sessions = metrics.read(tmp_path / "run" / "sessions.jsonl")
     assert [line.pop("env_steps") for line in sessions] == [0, 80]
     assert set(sessions[0].pop("devices")) == {jax.devices()[0].device_kind}
+    assert sessions[0].pop("machine") == versions.machine()
     assert sessions[0] == versions.current()
     settings = config.load(tmp_path / "run")
     assert settings.backend == backend

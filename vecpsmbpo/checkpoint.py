@@ -130,7 +130,7 @@ class Checkpoints:
     ) -> Saved | None:
         """The newest checkpoint that can be read, laid out on the mesh; None where there is none at all.
 
-        Damaged ones are warned of. Nothing is removed.
+        Damaged ones are warned of, where there is another before them. Nothing is removed.
 
         Args:
             shapes: of the train state, as `jax.eval_shape` of its initialisation gives them.
@@ -142,6 +142,7 @@ class Checkpoints:
             OSError: the system does not let it be read (`shortages`), which says nothing of what it holds.
         """
         reason: Exception | None = None
+        damaged: list[int] = []
         for step in reversed(self.steps()):
             if at not in (None, step):
                 continue
@@ -153,10 +154,12 @@ class Checkpoints:
                 if (number := shortages.number_of(error)) in shortages.NOT_READ:  # it may be whole all the same
                     raise OSError(number, os.strerror(number), str(self._directory / str(step))) from error
                 _log.debug("checkpoint %d", step, exc_info=error)
-                warn(f"the checkpoint at step {step} is damaged; taking the one before it")
                 reason = error
-                self._damaged.append(step)
+                damaged.append(step)
             else:
+                for passed_over in damaged:
+                    warn(f"the checkpoint at step {passed_over} is damaged; taking the one before it")
+                self._damaged += damaged
                 return Saved(step, _from_host(items["state"], shapes, layout), items["host"])
         if reason is not None:
             what = (str(reason).strip() or repr(reason)).splitlines()[0][:200]

@@ -27,7 +27,7 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
   vecpsmbpo compare runs/x runs/y                   the same as a table, with intervals
   vecpsmbpo report runs/x out=report.html           all a run has to show, on one page
   vecpsmbpo diagnose runs/x                         how good its models and critics are, into the run; or out=x.png
-  vecpsmbpo render runs/x out=walk.mp4              its best member at work; member=all: all of them
+  vecpsmbpo render runs/x out=walk.gif              its best member at work; member=all: all of them
   vecpsmbpo export runs/x out=policy/               its best policy as files that need nothing of this
   vecpsmbpo figure fig9 size=cpu out=fig9.png       a figure of the paper, from the runs of its experiment
   vecpsmbpo figure fig9 runs/x out=weights.png      figure 9's picture, who was likely to act, of any run

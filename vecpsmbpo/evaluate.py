@@ -1,6 +1,7 @@
 """Whole episodes of a trained run's policies: what `vecpsmbpo eval` shows and `Run.evaluate` returns."""
 
 import contextlib
+import sys
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -111,4 +112,4 @@ def _opened(stored: Settings) -> Iterator[tuple[Driver, TrainState, checkpoint.C
 
 
 def _warn(text: str) -> None:
-    Console(stderr=True).print(text)
+    print(f"vecpsmbpo: warning: {text}", file=sys.stderr)

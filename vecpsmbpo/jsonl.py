@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 Line = dict[str, Any]
-METRICS_FILE, EPISODES_FILE = "metrics.jsonl", "episodes.jsonl"  # of a run directory
+METRICS_FILE, EPISODES_FILE, SESSIONS_FILE = "metrics.jsonl", "episodes.jsonl", "sessions.jsonl"  # of a run directory
 STEP = "env_steps"
 INFINITY = "inf"  # in a swept value: JSON has no other
 BATCH = 20_000  # lines that are parsed at a time

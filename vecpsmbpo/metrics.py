@@ -13,12 +13,11 @@ import numpy as np
 
 from vecpsmbpo import jsonl, logged
 from vecpsmbpo.algorithms.base import Algorithm
-from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE, Line
+from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE, SESSIONS_FILE, Line
 from vecpsmbpo.loggers import Loggers
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
-SESSIONS_FILE = "sessions.jsonl"
 ALWAYS = tuple(name for name, quantity in logged.QUANTITIES.items() if quantity.always)
 read = jsonl.read
 

@@ -1,7 +1,10 @@
 """Which versions are at work: what every report of a fault has to say. Imports none of them."""
 
+import os
 import platform
+import re
 from importlib import metadata
+from pathlib import Path
 
 PACKAGES = ("vecpsmbpo", "jax", "mujoco")
 
@@ -13,6 +16,15 @@ def current() -> dict[str, str]:
 
 def line() -> str:
     return ", ".join(f"{name} {version}" for name, version in current().items())
+
+
+def machine() -> str:
+    """The computer in words: its processor, as Linux calls it, and how many cores it has."""
+    try:
+        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        found = None
+    return f"{found[1] if found else platform.machine()}, {os.cpu_count()} cores"
 
 
 def _version(package: str) -> str:

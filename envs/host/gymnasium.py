@@ -96,21 +96,29 @@ def _check_spaces(env: Any, name: str) -> None:
         raise SettingError(f"{name}: its actions are {action}; they must be bounded")
 
 
-def any_task(*, num_envs: int, seed: int, id: str) -> HostEnv:
+def any_task(*, num_envs: int, seed: int, id: str, render_mode: str | None = None) -> HostEnv:
     """Any registered Gymnasium environment. Termination of its MuJoCo tasks is known; of others it is learned.
 
+    Args:
+        render_mode: of Gymnasium; no setting, but what `look.stage` asks for.
+
     Raises:
-        SettingError: there is no such environment, or it cannot be learned.
+        SettingError: there is no such environment, it cannot be learned, or has no such `render_mode`.
     """
+    drawn = {"render_mode": render_mode} if render_mode else {}
 
     def make() -> Any:
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", message=".*out of date.*")  # the paper's tasks are the v4 ones
                 # No time limit of its own (-1): that is HostEnv's.
-                return gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True)
+                return gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True, **drawn)
         except (gymnasium.error.Error, ImportError) as error:
             raise SettingError(f"env.id={id}: {str(error).splitlines()[0]}") from None
+        except TypeError as error:
+            if "argument 'render_mode'" in str(error):
+                raise SettingError(f"env.id={id}: cannot be drawn: it takes no render_mode") from None
+            raise
 
     simulators = [GymnasiumSimulator(make(), seed + index, f"env.id={id}") for index in range(num_envs)]
     registered = simulators[0].env.spec.id  # `Hopper` is `Hopper-v5`

@@ -8,21 +8,22 @@ The file that it writes has, of the newest checkpoint:
     history  a few numbers of every checkpoint that is kept: `keep_checkpoints` says how many those are
 """
 
+import contextlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from vecpsmbpo import arguments
 from vecpsmbpo.look import files, runs
 from vecpsmbpo.look.runs import Run
+from vecpsmbpo.look.working import Working
 from vecpsmbpo.settings import SettingError
+from vecpsmbpo.words import of as in_words
 
 if TYPE_CHECKING:
     from vecpsmbpo.look.members import Trained
@@ -31,11 +32,13 @@ Array = np.ndarray
 
 FILE = "diagnostics.json"  # in a run's directory, where `report` finds it
 PARTS = ("task", "lane", "episodes", "env_steps", "models", "critics", "states", "history")  # of it, that are drawn
+# What reading and drawing a file raises that is none, or whose parts are of other kinds than `measure` gives them.
+DAMAGE = (OSError, LookupError, TypeError, AttributeError, ValueError, RecursionError)
 OPTIONS = {
     "episodes": arguments.whole("fresh ones, of every member", 1, at_least=1),
     "horizon": arguments.whole("steps ahead that models are asked for", 50, at_least=1),
     "lane": arguments.whole("of which seed and swept value, counted from 0", 0),
-    "seed": arguments.whole("of the fresh episodes", 0),
+    "seed": arguments.whole("of the fresh episodes", 0, at_most=2**31 - 1),
     "out": arguments.out(
         "the numbers, or a picture of them; without it, into the run", "", ".json", ".png", ".svg", ".pdf"
     ),
@@ -55,7 +58,8 @@ def run(words: Sequence[str]) -> int:
     files.check_writable(out)
     found = runs.load(path)
     runs.check_lane(found, options["lane"])
-    write(measure(found, **options), out)
+    with Working() as working:
+        write(measure(found, **options, working=working), out)
     print(f"written: {out}")
     return 0
 
@@ -83,30 +87,48 @@ def read(run: Run) -> dict[str, Any] | None:
     path = run.path / FILE
     if not path.exists():
         return None
-    try:
+    with reading(run):
         found = json.loads(path.read_text())
         return {**{name: found[name] for name in PARTS}, **found}
-    except (OSError, ValueError, KeyError, TypeError):
-        raise SettingError(f"{path}: cannot be read; vecpsmbpo diagnose {run.path} writes it again") from None
 
 
-def measure(run: Run, *, episodes: int = 1, horizon: int = 50, lane: int = 0, seed: int = 0) -> dict[str, Any]:
+@contextlib.contextmanager
+def reading(run: Run) -> Iterator[None]:
+    """In it the run's file is read, or drawn, which nobody has checked: whatever is wrong with it is one line.
+
+    Raises:
+        SettingError: something is.
+    """
+    try:
+        yield
+    except DAMAGE as error:
+        raise SettingError(
+            f"{run.path / FILE}: cannot be read ({in_words(error)}); vecpsmbpo diagnose {run.path} writes it again"
+        ) from None
+
+
+def measure(
+    run: Run, *, episodes: int = 1, horizon: int = 50, lane: int = 0, seed: int = 0, working: Working | None = None
+) -> dict[str, Any]:
     """The diagnosis of a lane, in JSON's types.
 
     Args:
         episodes: of each member.
         horizon: steps that are looked ahead.
         seed: of the fresh episodes.
+        working: is told what is being measured.
 
     Raises:
         SettingError: there is no checkpoint, or no such lane.
     """
     from vecpsmbpo.look import diagnostics, members  # and JAX with them
 
+    working = working or Working()  # which nobody has entered: it says nothing
+    working.on("reading checkpoints")
     history, found, probe = [], {}, None
     for trained in members.load_each(run, lane):
         probe = probe or _Probe(trained, episodes, horizon, seed)
-        found = probe.examine(trained)
+        found = probe.examine(trained, working)
         history.append({"env_steps": trained.step, **_summary(found)})
         del trained  # as in `evaluate.restore_each`
     about = {"task": run.settings.task, "run": run.name, "lane": run.settings.lanes[lane], "episodes": episodes}
@@ -139,7 +161,7 @@ class _Probe:
         members = settings.n_members if trained.has_members else 1
         self._world = fresh.world(settings, members * episodes, self._steps, seed)
 
-    def examine(self, trained: "Trained") -> dict[str, Any]:
+    def examine(self, trained: "Trained", working: Working) -> dict[str, Any]:
         """One checkpoint."""
         import jax
 
@@ -148,14 +170,18 @@ class _Probe:
         key = jax.random.key(self._seed)
         self._world.rewind()
         act = _members_act(trained, self._each) if trained.has_members else _evaluation_act(trained, self._each)
-        seen = fresh.collect(self._world, act, self._steps, key, each=partial(_shown, f"step {trained.step:,}"))
+        at = f"step {trained.step:,}"
+        each = partial(working.through, what=f"{at}: fresh episodes")
+        seen = fresh.collect(self._world, act, self._steps, key, each=each)
         random = np.random.default_rng(self._seed)
-        return {
-            "env_steps": trained.step,
-            "models": self._models(trained, seen, random, jax.random.fold_in(key, self._steps)),
-            "critics": self._critics(trained, seen, random),
-            "states": _states(trained, seen, random),
-        }
+        found: dict[str, Any] = {"env_steps": trained.step}
+        working.on(f"{at}: models")
+        found["models"] = self._models(trained, seen, random, jax.random.fold_in(key, self._steps))
+        working.on(f"{at}: critics")
+        found["critics"] = self._critics(trained, seen, random)
+        working.on(f"{at}: imagined states")
+        found["states"] = _states(trained, seen, random)
+        return found
 
     def _models(self, trained: "Trained", seen: Any, random: np.random.Generator, key: Any) -> dict[str, Any] | None:
         from vecpsmbpo.look import diagnostics
@@ -216,11 +242,6 @@ class _Probe:
             "spread_of_bias": bias.std(),
             "shown": {"member": member[places[:, 0]], "q": q[chosen], "earned": earned[chosen]},
         }
-
-
-def _shown(what: str, steps: Iterable[int]) -> Iterable[int]:
-    console = Console(stderr=True)
-    return track(list(steps), what, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _members_act(trained: "Trained", each: int) -> Any:

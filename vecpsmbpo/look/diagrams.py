@@ -17,6 +17,7 @@ Array = np.ndarray
 COLUMNS = 3  # pictures in a row of a sheet
 PANEL = (4.4, 3.2)
 GREY: Any = {"color": style.FAINT, "lw": 1.2}
+TREND = 3  # checkpoints that it takes at least to show how something changes over training
 
 
 class Panel(NamedTuple):
@@ -69,7 +70,7 @@ def panels(diagnosis: dict[str, Any]) -> Iterator[Panel]:
         yield from _model_panels(models)
     if critics := diagnosis["critics"]:
         yield _critic_panel(critics)
-    if len(diagnosis["history"]) > 1:
+    if len(diagnosis["history"]) >= TREND:
         yield from _history_panels(diagnosis["history"])
     if states := diagnosis["states"]:
         yield _states_panel(states)
@@ -97,7 +98,13 @@ def _model_panels(models: dict[str, Any]) -> Iterator[Panel]:
         "error by dimension",
         "the error of every coordinate of the observation and of the reward, in its standard deviations (darkest: one "
         "or more, if any is); mean over models",
-        lambda axes: _draw_dimensions(axes, models),
+        lambda axes: _draw_dimensions(axes, models, "error"),
+    )
+    yield Panel(
+        "error by dimension, as expected",
+        "the error that the models themselves expected of the same, in the same colours: lighter where they are too "
+        "sure, darker where they are not sure enough",
+        lambda axes: _draw_dimensions(axes, models, "expected"),
     )
     cells = zip(models["levels"], _array(models["coverage"]).mean(axis=(0, 2)), strict=True)
     shares = ", ".join(f"{100 * share:.0f}% within their {100 * level:.0f}% intervals" for level, share in cells)
@@ -134,11 +141,13 @@ def _draw_errors(axes: Axes, found: dict[str, Array], label: str) -> None:
     axes.legend(fontsize=7, ncols=2)
 
 
-def _draw_dimensions(axes: Axes, models: dict[str, Any]) -> None:
+def _draw_dimensions(axes: Axes, models: dict[str, Any], which: str) -> None:
+    """`which`, `error` or `expected`, in colours that are the same for both."""
     spread = _array(models["spread"])
-    errors = _array(models["error"]).mean(axis=0) / np.where(spread > 0, spread, np.nan)
-    names = models["dimensions"]
-    known = errors[np.isfinite(errors) & (errors > 0)]
+    unit = np.where(spread > 0, spread, np.nan)
+    both = {name: _array(models[name]).mean(axis=0) / unit for name in ("error", "expected")}
+    errors, names = both[which], models["dimensions"]
+    known = np.concatenate([values[np.isfinite(values) & (values > 0)] for values in both.values()])
     most = min(1.0, known.max(initial=1e-2))  # beyond a standard deviation a model knows nothing
     scale = LogNorm(min(max(known.min(initial=most), 1e-3 * most), 0.5 * most), most, clip=True)
     edges = np.arange(errors.shape[0] + 1) + 0.5
@@ -150,7 +159,7 @@ def _draw_dimensions(axes: Axes, models: dict[str, Any]) -> None:
     axes.grid(False)
     axes.set_xlabel("steps ahead")
     bar = axes.figure.colorbar(mesh, ax=axes, pad=0.02, fraction=0.05)
-    bar.set_label("error, in standard deviations")
+    bar.set_label(f"{'error' if which == 'error' else 'expected error'}, in standard deviations")
     bar.outline.set_visible(False)
 
 
@@ -196,14 +205,14 @@ def _draw_critics(axes: Axes, critics: dict[str, Any]) -> None:
 
 def _history_panels(history: list[dict[str, Any]]) -> Iterator[Panel]:
     seen = [point for point in history if point["critics"]]
-    if len(seen) > 1:
+    if len(seen) >= TREND:
         yield Panel(
             "Q over training",
             "the same at every checkpoint that is kept: mean Q, and mean return from the same states on",
             lambda axes: _draw_bias(axes, seen),
         )
     fitted = [point for point in history if point["errors"]]
-    if len(fitted) > 1:
+    if len(fitted) >= TREND:
         yield Panel(
             "model error over training",
             "the models' error one step ahead and farthest ahead, at every checkpoint that is kept; mean over models",

@@ -9,12 +9,11 @@ minari/       with also=minari: the real data, as a Minari data set
 """
 
 import dataclasses
-import functools
 import importlib.util
+import io
 import json
 import zipfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +33,6 @@ OPTIONS = {
     "out": arguments.out("where the files go", "policy"),
 }
 
-FILES = (WEIGHTS_FILE, "act.py", ABOUT_FILE)
 ADDITIONS = {"jax": ("flatbuffers",), "onnx": ("onnx",), "minari": ("minari", "h5py")}  # and what each needs
 OPSET, IR_VERSION = 17, 8  # of ONNX, from 2022: every runtime since then reads it
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -78,24 +76,40 @@ def run(words: Sequence[str]) -> int:
         _check_extra(name)
     found = runs.load(path)
     runs.check_lane(found, options["lane"])
-    if not found.settings.learns_by_sac:
-        raise SettingError(
-            f"run_dir={path}: only policies that learn by SAC can be exported, not algo={found.settings.algo}"
-        )
+    _check_exportable(found, options["member"])
     from vecpsmbpo.look import members
 
     trained = members.load(found, options["lane"])
     episodes = dataset.collect(trained, out / "minari") if "minari" in options["also"] else []
-    layers = export(trained, out, options["member"])
-    written = [out / name for name in FILES]
-    for name, make in (("jax", jax_function), ("onnx", onnx_model)):
-        if name in options["also"]:
-            written.append(out / f"policy.{name}")
-            files.write(written[-1], functools.partial(_save_bytes, make(layers)))
+    # All of them in memory first: what fails, fails before anything is written.
+    layers, contents = policy(trained, options["member"])
+    makers = {"policy.jax": jax_function, "policy.onnx": onnx_model}
+    asked = {name: make for name, make in makers.items() if name.partition(".")[2] in options["also"]}
+    contents |= {name: make(layers) for name, make in asked.items()}
+    files.write_together(out, contents, without=makers.keys() - asked.keys())
+    written = [out / name for name in contents]
     if "minari" in options["also"]:
         written.append(dataset.write(trained, episodes, out / "minari"))
     print(f"written: {', '.join(map(str, written))}")
     return 0
+
+
+def _check_exportable(run: runs.Run, member: str) -> None:
+    """Raises:
+    SettingError: the run has no single policy of the form that the files have.
+    """
+    settings = run.settings
+    if settings.plans_actions:
+        raise SettingError(f"run_dir={run.path}: algo={settings.algo} plans its actions; there is no policy to export")
+    if not settings.learns_by_sac:
+        raise SettingError(
+            f"run_dir={run.path}: what is exported is a network as SAC's, ReLU and a tanh at its end; the one of "
+            f"algo={settings.algo} is of another kind"
+        )
+    if settings.averages_members and member == "best":
+        raise SettingError(
+            "member=best: with posterior=average all members act together, which is no single policy; name one, n,m"
+        )
 
 
 def _check_extra(name: str) -> None:
@@ -109,11 +123,11 @@ def _check_extra(name: str) -> None:
             raise SettingError(f"also={name}: needs the package {package}; pip install 'vecpsmbpo[export]'")
 
 
-def export(trained: "Trained", out: Path, member: str) -> dict[str, np.ndarray]:
-    """Writes the policy's files into the directory `out`; its `weights`.
+def policy(trained: "Trained", member: str) -> tuple[dict[str, np.ndarray], dict[str, bytes]]:
+    """A policy's `weights`, and its files by name.
 
     Raises:
-        SettingError: there is no such member, or they cannot be written.
+        SettingError: there is no such member, or an option of the task cannot be written as JSON.
     """
     import jax
 
@@ -136,10 +150,7 @@ def export(trained: "Trained", out: Path, member: str) -> dict[str, np.ndarray]:
         text = json.dumps(about, indent=2, allow_nan=False) + "\n"
     except ValueError:  # a task's own option may be infinite
         raise SettingError(f"run_dir={run.path}: has an option that JSON cannot have, infinity or NaN") from None
-    files.write(out / WEIGHTS_FILE, functools.partial(_save, layers))
-    files.write_text(out / "act.py", ACT)
-    files.write_text(out / ABOUT_FILE, text)
-    return layers
+    return layers, {WEIGHTS_FILE: _archive(layers), "act.py": ACT.encode(), ABOUT_FILE: text.encode()}
 
 
 def settings_of(settings: Settings, lane: int) -> dict[str, Any]:
@@ -220,13 +231,11 @@ def onnx_model(layers: dict[str, np.ndarray]) -> bytes:
     return bytes(model.SerializeToString())
 
 
-def _save_bytes(content: bytes, path: Path) -> None:
-    path.write_bytes(content)
-
-
-def _save(layers: dict[str, np.ndarray], path: Path) -> None:
-    """As `np.savez`, without the moment of writing: the same policy is the same file."""
-    with zipfile.ZipFile(path, "w") as archive:
+def _archive(layers: dict[str, np.ndarray]) -> bytes:
+    """What `np.savez` writes, without the moment of writing: the same policy is the same file."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
         for name, values in layers.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as entry:
                 np.lib.format.write_array(entry, np.asarray(values), allow_pickle=False)
+    return content.getvalue()

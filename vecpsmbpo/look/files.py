@@ -1,7 +1,9 @@
 """What a command writes where it was told to: whole, or one line."""
 
+import contextlib
 import os
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from vecpsmbpo import atomic
@@ -24,6 +26,33 @@ def write(path: Path, make: Callable[[Path], object]) -> None:
 def write_text(path: Path, text: str) -> None:
     """As `write`, of a text."""
     write(path, lambda beside: beside.write_text(text, encoding="utf-8"))
+
+
+def write_together(folder: Path, contents: Mapping[str, bytes], without: Iterable[str] = ()) -> None:
+    """Writes the files of a folder that belong together, by their names: all of them beside it before the first takes
+    its place. Files called as in `without`, which earlier ones of the same kind may have had beside them, are removed.
+
+    Raises:
+        SettingError: they cannot be written; what stood in `folder` is as it was.
+    """
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".") as beside:
+            for name, content in contents.items():
+                with (Path(beside) / name).open("wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())  # as in `atomic.write`
+            for name in contents:
+                (Path(beside) / name).replace(folder / name)
+        for name in without:
+            (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        if is_new:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise SettingError(f"out={folder}: cannot be written ({error.strerror or error})") from None
 
 
 def check_writable(path: Path) -> None:

@@ -14,6 +14,7 @@ from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.checkpoint import Saved
 from vecpsmbpo.drivers.common import evaluation_policies
 from vecpsmbpo.evaluate import restore, restore_each
+from vecpsmbpo.layout import BY_SEED
 from vecpsmbpo.look.runs import Run, check_lane
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import Model, SeedState
@@ -101,6 +102,19 @@ class Trained:
         """The member that has earned the most per episode (`posterior.best`)."""
         return int(posterior.best(self.of_lane(self.state.posterior)))
 
+    def drawn(self) -> int:
+        """A member that the posterior draws now, where it `has_members`: the one that `eval_policy=posterior` evaluates
+        with the same key."""
+        algorithm: Any = self.algorithm
+
+        def draw(seed: SeedState, key: jax.Array) -> jax.Array:
+            member: jax.Array = algorithm.draw(seed.posterior, algorithm.values(seed), seed.hyper, key)[0]
+            return member
+
+        seeds = algorithm.layout.specs().seeds
+        program = algorithm.layout.jit_shard_map(jax.vmap(draw), (seeds, BY_SEED), BY_SEED)
+        return int(self.of_lane(np.asarray(program(self.state, self.state.key))))
+
 
 def load(run: Run, lane: int = 0) -> Trained:
     """A lane of the run's newest checkpoint.
@@ -134,29 +148,34 @@ def _trained(run: Run, algorithm: Algorithm, saved: Saved, lane: int) -> Trained
 
 
 def acting(trained: Trained, member: str) -> list[tuple[str, Act]]:
-    """The policies that `member` names, each with its own name.
+    """The policies that `member` names, each with its own name, which says who it is: `best 1,0`.
 
     Args:
-        member: `best`, `posterior` (drawn now), `all`, or `n,m`.
+        member: `best`, `posterior` (one member, drawn now), `all`, or `n,m`.
 
     Raises:
         SettingError: the algorithm plans, has no members, or not this one.
     """
-    settings = trained.run.settings
+    settings, chosen = trained.run.settings, member in ("best", "posterior")
     if settings.plans_actions:
         raise SettingError(f"run_dir={trained.run.path}: algo={settings.algo} plans its actions; there is no policy")
-    if member in ("best", "posterior"):
-        return [(member, _evaluated(trained, member))]
     if not trained.has_members:
+        if chosen:
+            return [(member, _evaluated(trained, member))]
         raise SettingError(f"member={member}: must be best or posterior with algo={settings.algo}")
+    if chosen and settings.averages_members:
+        return [("all together", _averaged(trained))]
     names = member_names(trained.run)
-    if member != "all" and member not in names:
+    if not chosen and member not in ("all", *names):
         raise SettingError(f"member={member}: must be best, posterior, all or one of {'  '.join(names)}")
     actor, actors = trained.nets.actor, trained.actors()
 
     def policy(index: int) -> Act:
         return partial(_mean_action, jax.tree.map(lambda x: x[index], actors), actor=actor)
 
+    if chosen:
+        index = trained.best() if member == "best" else trained.drawn()
+        return [(f"{member} {names[index]}", policy(index))]
     return [(name, policy(index)) for index, name in enumerate(names) if member in ("all", name)]
 
 
@@ -181,13 +200,14 @@ def _evaluation_action(policy: Any, obs: Any, *, algorithm: Algorithm) -> jax.Ar
 
 
 def _evaluated(trained: Trained, who: str) -> Act:
-    """The mean action of the policy that `eval_policy=who` evaluates; with `posterior=average`, where nobody earns
-    anything, the mean of all members' actions."""
-    settings = trained.run.settings
-    settings = replace(settings, eval_policy=who, eval_actions="mean")
-    if settings.averages_members:
-        actor, actors = trained.nets.actor, trained.actors()
-        return jax.jit(lambda obs: jax.vmap(lambda params: actor.distribution(params, obs).mode())(actors).mean(axis=0))
+    """The mean action of the policy that `eval_policy=who` evaluates, where there are no members to ask."""
+    settings = replace(trained.run.settings, eval_policy=who, eval_actions="mean")
     algorithm = replace(trained.algorithm, settings=settings)
     chosen = trained.of_lane(evaluation_policies(algorithm)(trained.state, trained.state.key))
     return partial(_evaluation_action, chosen, algorithm=algorithm)
+
+
+def _averaged(trained: Trained) -> Act:
+    """The mean of all members' actions: of `posterior=average`, where nobody earns anything."""
+    actor, actors = trained.nets.actor, trained.actors()
+    return jax.jit(lambda obs: jax.vmap(lambda params: actor.distribution(params, obs).mode())(actors).mean(axis=0))

@@ -18,7 +18,7 @@ LIGHTNESS = 0.62  # of series on dark paper, at least
 
 CSS = """
 :root { color-scheme: light dark; --page: #f6f8fa; --card: #ffffff; --edge: #d8dee4; --ink: #1f2328; --soft: #59636e;
-  --accent: #0072b2; }
+  --accent: #0072b2; --shade: #1f232833; }
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--page); color: var(--ink); font: 15px/1.5 system-ui, -apple-system, "Segoe UI",
   Roboto, sans-serif; }
@@ -28,6 +28,8 @@ h2 { font-size: 1.15rem; margin: 36px 0 4px; }
 h3 { font-size: 1rem; margin: 20px 0 4px; }
 p { margin: 4px 0 12px; max-width: 76ch; }
 .soft { color: var(--soft); }
+.above { margin: 12px 0 -8px; font-weight: 600; }
+.warning { border-left: 3px solid #d55e00; padding-left: 10px; }
 .state { display: inline-block; border: 1px solid var(--edge); border-radius: 99px; padding: 0 10px; font-size: .85rem;
   background: var(--card); }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 10px; margin: 16px 0; }
@@ -40,17 +42,23 @@ figure { margin: 0; padding: 10px 12px; min-width: 0; }
 figure svg { width: 100%; height: auto; display: block; }
 figure video, figure img { width: 100%; border-radius: 4px; display: block; }
 figcaption { font-size: .85rem; color: var(--soft); margin-top: 4px; }
-.wide { overflow-x: auto; margin: 12px 0; }
-table { border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabular-nums; background: var(--card); }
+/* Where a table goes on to the right, its edge is shaded: the first gradient lies on the second at the end. */
+.wide { overflow-x: auto; margin: 12px 0; width: fit-content; max-width: 100%; border: 1px solid var(--edge);
+  border-radius: 8px; background: linear-gradient(to left, var(--card) 40%, transparent) right / 40px 100% no-repeat
+  local, linear-gradient(to left, var(--shade), transparent) right / 16px 100% no-repeat scroll, var(--card); }
+table { border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabular-nums; }
+tr:last-child td { border-bottom: 0; }
 th, td { padding: 4px 12px 4px 0; text-align: right; border-bottom: 1px solid var(--edge); white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; padding-left: 10px; }
+th:first-child, td:first-child { text-align: left; padding-left: 10px; position: sticky; left: 0;
+  background: var(--card); }
 th { font-weight: 600; color: var(--soft); }
 pre { background: var(--card); border: 1px solid var(--edge); border-radius: 8px; padding: 10px 14px; font-size: .84rem;
   white-space: pre-wrap; overflow-wrap: anywhere; }
 details { margin: 12px 0; }
 summary { cursor: pointer; color: var(--accent); padding: 6px 0; }
 @media (prefers-color-scheme: dark) {
-  :root { --page: #010409; --card: #0d1117; --edge: #30363d; --ink: #e6edf3; --soft: #9198a1; --accent: #4aa8e0; }
+  :root { --page: #010409; --card: #0d1117; --edge: #30363d; --ink: #e6edf3; --soft: #9198a1; --accent: #4aa8e0;
+    --shade: #e6edf34d; }
 }
 @media print { body { background: #fff; } figure, .tile { break-inside: avoid; } }
 """

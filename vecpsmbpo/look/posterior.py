@@ -18,9 +18,22 @@ from vecpsmbpo.look.runs import Columns, Lane
 
 Array = np.ndarray
 
+NEEDED = {"episode": 1, "model": 1, "policy": 1, "return": 1, "random": 1, "probs": 2}  # columns, and their axes
 BINS = 240  # most columns: with more episodes each stands for several
 # From nothing to blue: it can be laid on white and on black paper.
 SHADES = LinearSegmentedColormap.from_list("shades", [(0.0, 0.447, 0.698, 0.0), (0.0, 0.447, 0.698, 1.0)])
+
+
+def lacking(episodes: Columns) -> list[str]:
+    """The columns that a picture needs and a log with episodes has not, or not as such numbers."""
+    if not episodes:
+        return []
+    shapes = {name: np.ndim(episodes.get(name, 0)) for name in NEEDED}
+    return [
+        name
+        for name, axes in NEEDED.items()
+        if shapes[name] != axes or (name in ("episode", "probs") and not np.isfinite(episodes[name]).all())
+    ]
 
 
 def acting(episodes: Columns, n_policies: int) -> Array:
@@ -104,7 +117,8 @@ def _draw_returns(axes: Axes, episodes: Columns, acts: Array) -> None:
     axes.set_ylabel("return")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    axes.legend(loc="best", handletextpad=0.4)
+    # Above, and not among the dots.
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2, ncols=3, handletextpad=0.4)
 
 
 def _draw_spread(axes: Axes, index: Array, earned: Array) -> None:

@@ -6,38 +6,49 @@ import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
-from rich.console import Console
-from rich.progress import track
 
 from vecpsmbpo import arguments
 from vecpsmbpo.look import exported, files, runs, stage
 from vecpsmbpo.look.runs import Run
+from vecpsmbpo.look.working import Working
 from vecpsmbpo.settings import SettingError, Settings
 
 Array = np.ndarray
 Policies = list[tuple[str, Callable[[Any], Any]]]  # name, and obs [..., O] -> action [..., A]
 
+WIDEST = 8192  # pixels that MuJoCo could draw with Mesa's EGL: of 16384 the framebuffer was not complete
 OPTIONS = {
     "episodes": arguments.whole("one after the other", 1, at_least=1),
-    "member": arguments.text("who acts", "best", "best, posterior, all, or n,m"),
+    "member": arguments.text(
+        "who acts; posterior: one member, drawn from it for all episodes; all: a row for each model",
+        "best",
+        "best, posterior, all, or n,m",
+    ),
     "lane": arguments.whole("of which seed and swept value, counted from 0", 0),
-    "seed": arguments.whole("of the episodes", 0),
+    "seed": arguments.whole("of the episodes", 0, at_most=2**31 - 1),
     "steps": arguments.wholes("of training, whose checkpoints act side by side; without it, the newest"),
     "length": arguments.whole("steps after which an episode is cut, at most the run's own; 0: those", 0),
-    "width": arguments.whole("of each picture in pixels; without it, as many show", 0, at_least=64),
-    "out": arguments.out("the film, or a strip of its frames", "walk.mp4", ".mp4", ".gif", ".png"),
+    "width": arguments.whole("of each picture in pixels; without it, as many show", 0, at_least=64, at_most=WIDEST),
+    "out": arguments.out(
+        "the film, or a strip of its frames; without it walk.mp4, or walk.gif where the extra `video` is not installed",
+        "",
+        *(".mp4", ".gif", ".png"),
+    ),
 }
 FRAMES_PER_S = 30
 STRIP = 4  # frames of a .png, as in figure 8
-SINGLE, TILE = 480, 240  # pixels: the width of one picture, and of each of several
+SINGLE, TILE, SHEET = 480, 240, 1920  # pixels: the width of one picture, of each of several, and of all together
+NARROW = 170  # pixels: where step and return have no room beside each other
 ENDED = 0.45  # brightness of a tile whose episode is over
 PLATFORMS = ("egl", "osmesa")
+OWN = "episode"  # the film that a run with a page, or a logger that takes films, makes of itself at its end
+OWN_S = 600.0  # that it may take
 
 
 class Tile(NamedTuple):
@@ -46,12 +57,14 @@ class Tile(NamedTuple):
     Attributes:
         name: of the member.
         picture: [H, W, 3] uint8, of now or of its end.
+        step: how many it has taken.
         earned: its return so far.
         over: whether it has ended.
     """
 
     name: str
     picture: Array
+    step: int
     earned: float
     over: bool
 
@@ -64,7 +77,6 @@ def run(words: Sequence[str]) -> int:
     """
     named, options = arguments.parse("render", words, OPTIONS)
     policy = exported.load(named[0]) if len(named) == 1 and exported.is_one(named[0]) else None
-    out = options["out"]
     policies: Callable[[], Policies]
     if policy is None:
         (path,) = arguments.run_dirs("render", named, most=1)
@@ -76,14 +88,48 @@ def run(words: Sequence[str]) -> int:
             if options[name] != OPTIONS[name].default:
                 raise SettingError(f"{name}: {policy.path} is one policy, without a run")
         settings, policies = policy.settings, functools.partial(_alone, policy)
+    out = options["out"] = options["out"] or _usual_out()
     files.check_writable(out)
-    if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+    if out.suffix.lower() == ".mp4" and not _makes_mp4():
         raise SettingError(f"out={out}: .mp4 needs imageio-ffmpeg; pip install 'vecpsmbpo[video]', or take .gif")
     os.environ["MUJOCO_GL"] = platform()
-    frames, frame_s = film(settings, policies(), options)
-    files.write(out, functools.partial(_write, frames, frame_s))
+    with Working() as working:
+        working.on("reading what acts")
+        frames, frame_s = film(settings, policies(), options, working)
+        working.on(f"writing {out}")
+        files.write(out, functools.partial(_write, frames, frame_s))
     print(f"written: {out}")
     return 0
+
+
+def _makes_mp4() -> bool:
+    return importlib.util.find_spec("imageio_ffmpeg") is not None
+
+
+def _usual_out() -> Path:
+    """Where a film goes that is not told where; says so where it is not the better kind."""
+    if _makes_mp4():
+        return Path("walk.mp4")
+    print("a .gif, since .mp4 needs imageio-ffmpeg: pip install 'vecpsmbpo[video]'")
+    return Path("walk.gif")
+
+
+def keep(run_dir: Path, warn: Callable[[str], None]) -> None:
+    """Films an episode of a run's best member into its directory; what goes wrong with it is no reason to stop.
+
+    In a process of its own, since MuJoCo chooses what it draws with when it is imported, and who trains has imported it
+    to draw nothing; on the CPU, since the devices are full of the run.
+    """
+    out = run_dir / f"{OWN}{'.mp4' if _makes_mp4() else '.gif'}"
+    command = [sys.executable, "-m", "vecpsmbpo.cli", "render", f"run_dir={run_dir}", f"out={out}"]
+    on_cpu = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    try:
+        subprocess.run(command, env=on_cpu, capture_output=True, text=True, timeout=OWN_S, check=True)
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.strip().splitlines() or [f"exit status {error.returncode}"]
+        warn(f"{out} is not made ({said[-1].removeprefix('vecpsmbpo: ')})")
+    except (OSError, subprocess.TimeoutExpired) as error:
+        warn(f"{out} is not made ({error})")
 
 
 def platform() -> str:
@@ -108,29 +154,41 @@ def platform() -> str:
     raise SettingError("render: there is neither EGL nor OSMesa to draw with; apt-get install libegl1 or libosmesa6")
 
 
-def film(settings: Settings, policies: Policies, options: dict[str, Any]) -> tuple[list[Array], float]:
+def film(
+    settings: Settings, policies: Policies, options: dict[str, Any], working: Working
+) -> tuple[list[Array], float]:
     """Episodes of policies, side by side: frames [H, W, 3] uint8, and seconds between them.
 
     Every one begins in the same state.
 
     Args:
         settings: of the run, which has the task.
+        working: is told which step is being drawn.
 
     Raises:
         SettingError: the task cannot be drawn.
     """
-    width = options["width"] or (SINGLE if len(policies) == 1 else TILE)
+    columns = _columns(settings, len(policies), options)
+    width = options["width"] or (SINGLE if len(policies) == 1 else max(64, min(TILE, SHEET // columns)))
     studio = Studio(settings, [name for name, _ in policies], width, options["seed"])
-    columns = 1 if options["out"].suffix.lower() == ".png" else int(np.ceil(np.sqrt(len(policies))))
     frames: list[Array] = []
-    console = Console(stderr=True)
-    episodes = track(
-        range(options["episodes"]), "drawing", console=console, transient=True, disable=not console.is_terminal
-    )
-    for _ in episodes:
-        for tiles in studio.episode([act for _, act in policies], options["length"]):
+    count = options["episodes"]
+    for episode in range(1, count + 1):
+        each = functools.partial(working.through, what=f"drawing episode {episode} of {count}")
+        for tiles in studio.episode([act for _, act in policies], options["length"], each=each):
             frames.append(mosaic(tiles, columns))
     return frames, studio.frame_s
+
+
+def _columns(settings: Settings, count: int, options: dict[str, Any]) -> int:
+    """Of the mosaic: one for a strip; of all members one for each policy, so that a row is a model; else as many as
+    there are rows."""
+    if options["out"].suffix.lower() == ".png":
+        return 1
+    of_models = count == settings.n_models * settings.policies_per_model  # else policies belong to none
+    if options["member"] == "all" and settings.n_models > 1 and of_models:
+        return settings.policies_per_model
+    return int(np.ceil(np.sqrt(count)))
 
 
 def _check(run: Run, options: dict[str, Any]) -> None:
@@ -167,7 +225,7 @@ def _policies(run: Run, options: dict[str, Any]) -> Policies:
         raise SettingError("member=all: with steps= there is room for one member")
     found = []
     for trained in members.load_each(run, options["lane"], steps):
-        found += [(f"step {trained.step:,}", act) for _, act in members.acting(trained, who)]
+        found += [(f"trained {trained.step:,} steps: {name}", act) for name, act in members.acting(trained, who)]
         del trained  # as in `evaluate.restore_each`
     return found
 
@@ -186,13 +244,25 @@ class Studio:
         """Seconds between two frames."""
         return self._every * self._stages[0].dt
 
-    def episode(self, policies: Sequence[Callable[[Any], Any]], length: int = 0) -> Iterator[list[Tile]]:
-        """The tiles of every frame, until all episodes are over or `length` steps are done (0: no limit)."""
+    def episode(
+        self,
+        policies: Sequence[Callable[[Any], Any]],
+        length: int = 0,
+        *,
+        each: Callable[[Iterable[int]], Iterable[int]] = lambda steps: steps,
+    ) -> Iterator[list[Tile]]:
+        """The tiles of every frame, the last one included, until all episodes are over or `length` steps are done (0:
+        no limit).
+
+        Args:
+            each: shows progress over the steps.
+        """
         observations = [one.reset() for one in self._stages]
-        tiles = [Tile(name, one.picture(), 0.0, False) for name, one in zip(self._names, self._stages, strict=True)]
+        tiles = [Tile(name, one.picture(), 0, 0.0, False) for name, one in zip(self._names, self._stages, strict=True)]
         yield tiles
         limit = min(length or self._limit, self._limit)
-        for t in range(1, limit + 1):
+        for t in each(range(1, limit + 1)):
+            shown = t % self._every == 0 or t == limit
             for index, (one, act, tile) in enumerate(zip(self._stages, policies, tiles, strict=True)):
                 if tile.over:
                     continue
@@ -200,26 +270,28 @@ class Studio:
                 observations[index] = step.obs
                 over = bool(step.terminated[0] | step.truncated[0]) or t == self._limit
                 # A simulator whose episode is over may have been reset already: its last picture stays.
-                picture = one.picture() if t % self._every == 0 and not over else tile.picture
-                tiles[index] = Tile(tile.name, picture, tile.earned + float(step.reward[0]), over)
-            if t % self._every == 0:
+                picture = one.picture() if shown and not over else tile.picture
+                tiles[index] = Tile(tile.name, picture, t, tile.earned + float(step.reward[0]), over)
+            ended = all(tile.over for tile in tiles)
+            if shown or ended:
                 yield tiles
-            if all(tile.over for tile in tiles):
+            if ended:
                 return
 
 
 def mosaic(tiles: Sequence[Tile], columns: int) -> Array:
-    """The tiles in rows of `columns`, each with its member and return: [H, W, 3] uint8."""
+    """The tiles in rows of `columns`, each with its member, step and return: [H, W, 3] uint8."""
     height, width = tiles[0].picture.shape[:2]
     rows = -(-len(tiles) // columns)
     # Even sizes: the video's colours are stored at half resolution.
     sheet = Image.new("RGB", (columns * width + columns * width % 2, rows * height + rows * height % 2))
+    apart = "   " if width > NARROW else "\n"
+    look: dict[str, Any] = {"fill": "white", "stroke_width": 2, "stroke_fill": "black", "font_size": 13}
     for index, tile in enumerate(tiles):
         picture = (tile.picture * (ENDED if tile.over and len(tiles) > 1 else 1.0)).astype(np.uint8)
         image = Image.fromarray(picture)
-        ImageDraw.Draw(image).text(
-            (6, 4), f"{tile.name}   {tile.earned:.0f}", fill="white", stroke_width=2, stroke_fill="black", font_size=13
-        )
+        text = f"{tile.name}\nstep {tile.step:,}{apart}return {tile.earned:,.0f}"
+        ImageDraw.Draw(image).multiline_text((6, 4), text, **look)
         sheet.paste(image, (index % columns * width, index // columns * height))
     return np.asarray(sheet)
 

@@ -106,7 +106,7 @@ class Run:
         """Columns of episodes.jsonl of all lanes, [E] each; `probs` [E, N·M]."""
         path = self.path / EPISODES_FILE
         with waiting.reading([path] if self.watched else []) as advance:
-            return read(path, advance=advance).columns
+            return read(path, needed=("env_steps", *self.settings.lanes[0]), advance=advance).columns
 
     def of_lane(self, values: Mapping[str, float]) -> Columns:
         """`episodes` of the lane with this seed and these swept values."""

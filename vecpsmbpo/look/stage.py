@@ -5,14 +5,16 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
+from PIL import Image
 
-from vecpsmbpo import envs
+from vecpsmbpo import envs, words
 from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import SettingError, Settings
 
 Array = np.ndarray
 
 FRAME_S = 1 / 30  # of a simulator that does not say how long a control step is
+RENDER_MODE = "rgb_array"  # of a Gymnasium environment that draws itself
 
 
 class Stage(Protocol):
@@ -51,7 +53,10 @@ class HostStage:
     """An original simulator."""
 
     def __init__(self, settings: Settings, width: int, seed: int):
-        self._env = envs.make(settings.env, "host", num_envs=1, seed=seed, **dict(settings.env_options))
+        options = dict(settings.env_options)
+        if settings.env == "gymnasium":  # which has to be told before; whoever makes an env=custom chooses for himself
+            options["render_mode"] = RENDER_MODE
+        self._env = envs.make(settings.env, "host", num_envs=1, seed=seed, **options)
         simulator = self._env.simulators[0]
         self.dt, self.picture = control_dt(simulator), camera(simulator, width)
         self.episode_length = self._env.spec.episode_length
@@ -134,22 +139,30 @@ def _draw(scene: Scene, renderer: Any, view: int, states: Any) -> Array:
 
 
 def _renderer(model: Any, width: int) -> tuple[Any, int]:
-    """MuJoCo's, of pictures four by three, and the task's first camera or, where it has none, the free one."""
+    """MuJoCo's, of pictures four by three, and the task's first camera or, where it has none, the free one.
+
+    Raises:
+        SettingError: the driver has no room for pictures so wide.
+    """
     import mujoco
 
     height = width * 3 // 4
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-    return mujoco.Renderer(model, height, width), 0 if model.ncam else -1
+    try:
+        return mujoco.Renderer(model, height, width), 0 if model.ncam else -1
+    except mujoco.FatalError as error:
+        raise SettingError(f"width={width}: MuJoCo cannot draw so wide a picture here ({error})") from None
 
 
 def camera(simulator: Any, width: int) -> Callable[[], Array]:
     """Draws what a simulator on the host is in: [H, W, 3] uint8.
 
-    MuJoCo's own renderer where the simulator is one, else the environment's `render`.
+    MuJoCo's own renderer where the simulator is one, else the environment's `render`, whose pictures are brought to the
+    width.
 
     Raises:
-        SettingError: it can do neither.
+        SettingError: it can do neither; the camera itself raises it where `render` fails.
     """
     model, data = _mujoco(simulator)
     if model is not None:
@@ -161,9 +174,17 @@ def camera(simulator: Any, width: int) -> Callable[[], Array]:
 
         return draw
     env = getattr(simulator, "env", None)
-    if env is None or getattr(env, "render_mode", None) != "rgb_array":
-        raise SettingError("render: this environment cannot be drawn; give it render_mode='rgb_array'")
-    return lambda: np.asarray(env.render(), np.uint8)
+    if env is None or getattr(env, "render_mode", None) != RENDER_MODE:
+        raise SettingError(f"render: this environment cannot be drawn: it is not made with render_mode='{RENDER_MODE}'")
+
+    def own() -> Array:
+        try:
+            picture = Image.fromarray(np.asarray(env.render(), np.uint8))
+        except Exception as error:  # whatever a task's own code raises, such as that pygame is missing
+            raise SettingError(f"render: this environment cannot draw itself ({words.of(error)})") from None
+        return np.asarray(picture.resize((width, round(width * picture.height / picture.width))))
+
+    return own
 
 
 def _mujoco(simulator: Any) -> tuple[Any, Any]:
@@ -173,7 +194,8 @@ def _mujoco(simulator: Any) -> tuple[Any, Any]:
     if physics is not None:  # the control suite
         return physics.model.ptr, physics.data.ptr
     core = getattr(env, "unwrapped", None)
-    return getattr(core, "model", None), getattr(core, "data", None)
+    model, data = getattr(core, "model", None), getattr(core, "data", None)
+    return (model, data) if hasattr(data, "qpos") else (None, None)
 
 
 def control_dt(simulator: Any) -> float:

@@ -17,6 +17,7 @@ from vecpsmbpo import (
     crash,
     health,
     jsonl,
+    loggers,
     metrics,
     placement,
     processes,
@@ -26,7 +27,7 @@ from vecpsmbpo import (
 )
 from vecpsmbpo.drivers import Driver, Interrupted, Returns
 from vecpsmbpo.envs.host.batched import SimulatorError
-from vecpsmbpo.look import report
+from vecpsmbpo.look import render, report
 from vecpsmbpo.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
@@ -135,7 +136,8 @@ class _Session:
                 if self.frozen.all():
                     self.display.say("every lane is frozen: there is nothing to go on with")
                     return self._status
-                self.log.session({"env_steps": self.env_steps, **versions.current(), "devices": self._devices()})
+                began = {"env_steps": self.env_steps, **versions.current(), "devices": self._devices()}
+                self.log.session({**began, "machine": versions.machine()})
                 # At once, and not after hours.
                 self._check_disk(settings.total_steps)
                 if self.saved_step is None:
@@ -146,6 +148,7 @@ class _Session:
                 while self.env_steps < settings.total_steps and not self.frozen.all() and not self._asked_to(stop):
                     self._chunk()
                 self._save()
+                self._film()
                 return self._farewell()
         except Interrupted as error:
             return self._failed(f"at step {error.step}", error)
@@ -248,6 +251,17 @@ class _Session:
             self._save()
         shown = epoch % settings.checkpoint_every == 0 or self.env_steps >= settings.total_steps
         if settings.report and shown and processes.is_first():
+            report.keep(self.run_dir, _warn)
+
+    def _film(self) -> None:
+        """An episode of a run that is complete, where somebody will see it: on its page, or at a logger's server."""
+        settings = self.settings
+        seen = settings.report or not {loggers.TENSORBOARD}.issuperset(settings.loggers)
+        if not seen or self.env_steps < settings.total_steps or settings.plans_actions or not processes.is_first():
+            return
+        self.display.say("filming an episode …")
+        render.keep(self.run_dir, _warn)
+        if settings.report:
             report.keep(self.run_dir, _warn)
 
     def _lines(self, returns: Returns, seconds: float) -> list[metrics.Line]:
