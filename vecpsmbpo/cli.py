@@ -4,14 +4,12 @@ import contextlib
 import importlib
 import io
 import os
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
-from vecpsmbpo import crash, limits
+from vecpsmbpo import crash, interrupt, limits, words
 from vecpsmbpo.settings import SettingError, Settings
 
 HELP = """\
@@ -67,7 +65,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError:
         print("vecpsmbpo: out of memory", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:  # before a run heeds signals itself, or a second one
+    except (ValueError, RuntimeError) as error:
+        if not (line := words.of_environment(error)):
+            raise
+        print(f"vecpsmbpo: {line}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:  # where no run heeds signals
         print("vecpsmbpo: interrupted", file=sys.stderr)
         return 130
 
@@ -101,36 +104,28 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def _train(overrides: list[str]) -> int:
-    from vecpsmbpo import config
+    with interrupt.leaving(crash.end):
+        from vecpsmbpo import config
 
-    status, in_order = _run(config.resolve(overrides))
+        settings = config.resolve(overrides)
+    status, in_order = _run(settings)
     return status if in_order else _leave(status)
 
 
 @contextlib.contextmanager
-def _nothing_to_save() -> Iterator[None]:
-    """While JAX is imported, for which there is room: Ctrl-C ends the process at once. As an exception it can be lost
-    in a module that is being imported, which catches everything."""
-
-    def leave(number: int, frame: Any) -> None:
-        print("vecpsmbpo: interrupted", file=sys.stderr, flush=True)
-        crash.end()
-        os._exit(130)
-
-    if "jax" in sys.modules or threading.current_thread() is not threading.main_thread():
+def _importing_jax() -> Iterator[None]:
+    """While JAX is imported, for which there is room."""
+    if "jax" in sys.modules:
         yield
         return
     limits.check_start()
-    before = signal.signal(signal.SIGINT, leave)
-    try:
+    with interrupt.leaving(crash.end):
         yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _run(settings: Settings) -> tuple[int, bool]:
     """Trains; the exit status, and whether the process may end as processes do."""
-    with _nothing_to_save():
+    with _importing_jax():
         from vecpsmbpo import processes, runtime
         from vecpsmbpo.training import DiskError, OutOfMemory, train
 
@@ -138,16 +133,20 @@ def _run(settings: Settings) -> tuple[int, bool]:
     try:
         return train(settings), True
     except (DiskError, OutOfMemory, processes.LostProcess, SettingError) as error:
-        if isinstance(error, SettingError) and not processes.are_several():
+        alone = not isinstance(error, processes.NotTogether) and not processes.are_several()
+        if isinstance(error, SettingError) and alone:
             raise
         print(f"vecpsmbpo: {error}", file=sys.stderr, flush=True)
         return (1 if isinstance(error, processes.LostProcess) else 2), False
+    except KeyboardInterrupt:  # before a run heeds signals itself, or a second one
+        print("vecpsmbpo: interrupted", file=sys.stderr, flush=True)
+        return 130, False
 
 
 def _leave(status: int) -> NoReturn:
     """Ends the process at once: the writer threads of orbax would each report the same disk again, in tracebacks of
     their own, while the interpreter ends; there may be no memory for that; and JAX would wait for the processes that
-    have left."""
+    have left, or have not come."""
     crash.end()
     os._exit(status)
 
@@ -220,7 +219,7 @@ def _eval(rest: list[str]) -> int:
     else:
         stored = config.load(run_dir)
         settings = config.for_evaluation(stored, given)
-    with _nothing_to_save():
+    with _importing_jax():
         from vecpsmbpo import runtime
         from vecpsmbpo.evaluate import show
 

@@ -76,10 +76,11 @@ def train(run: Run, heeding: AbstractContextManager[Stop]) -> Outcome:
             from vecpsmbpo import runtime
             from vecpsmbpo.training import DiskError, OutOfMemory
             from vecpsmbpo.training import train as train_here
-        except ImportError as error:
-            return _failed(1, words.of(error))
         except SettingError as error:
             return _failed(2, str(error))
+        except (ImportError, ValueError, RuntimeError) as error:
+            line = words.of_environment(error)
+            return _failed(2, line) if line else _failed(1, words.of(error))
         try:
             runtime.check_flags()
             return Outcome(train_here(run.settings, stop))
