@@ -142,9 +142,9 @@ class Checkpoints:
             OSError: the system does not let it be read (`shortages`), which says nothing of what it holds.
         """
         reason: Exception | None = None
-        for step in reversed(self.steps()):
-            if at not in (None, step):
-                continue
+        steps = [step for step in self.steps() if at in (None, step)]
+        while steps:
+            step = steps.pop()
             try:
                 items = self._read(step, shapes, layout)
             except SettingError:
@@ -153,7 +153,7 @@ class Checkpoints:
                 if (number := shortages.number_of(error)) in shortages.NOT_READ:  # it may be whole all the same
                     raise OSError(number, os.strerror(number), str(self._directory / str(step))) from error
                 _log.debug("checkpoint %d", step, exc_info=error)
-                warn(f"the checkpoint at step {step} is damaged; taking the one before it")
+                warn(f"the checkpoint at step {step} is damaged" + "; taking the one before it" * bool(steps))
                 reason = error
                 self._damaged.append(step)
             else:

@@ -10,7 +10,6 @@ import contextlib
 import functools
 import re
 import socket
-import sys
 import threading
 import zlib
 from collections.abc import Iterator
@@ -100,7 +99,7 @@ def _initialize(distributed: str, where: dict[str, Any]) -> None:
     if waiting.is_alive():
         address = where.get("coordinator_address")
         at = f", of which process 0 is to answer at {address}," if where.get("process_id") else ""
-        print(f"vecpsmbpo: waiting for the other processes of the run{at} for up to {PATIENCE_S} s …", file=sys.stderr)
+        words.complain(f"waiting for the other processes of the run{at} for up to {PATIENCE_S} s …")
         waiting.join(PATIENCE_S - SILENCE_S)
         if waiting.is_alive():
             what = f"nobody answers at {address}" if at and not _answers(address) else "the others have not all come"
@@ -121,7 +120,7 @@ def _answers(address: str) -> bool:
 
 def _address(distributed: str) -> dict[str, Any]:
     found = re.fullmatch(r"([^/]+:\d+)/(\d+)/(\d+)", distributed, re.ASCII)
-    if not found or int(found[2]) >= int(found[3]):
+    if not found or int(found[2]) >= int(found[3]) or not 0 < int(found[1].rpartition(":")[2]) < 2**16:
         raise SettingError(
             f"distributed={distributed}: must be auto, or host:port/index/processes with index from 0 to processes - 1"
         )

@@ -1,7 +1,19 @@
-"""Exceptions in one line: of other people's code, whose stack says less than where it failed."""
+"""What is said on stderr, one line each; exceptions, too, of other people's code, whose stack says less than where it
+failed."""
 
 import os
 import re
+import sys
+
+
+def complain(what: object) -> None:
+    """Says it on stderr. A value from a command line may hold line ends and what steers a terminal: they are shown."""
+    text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(what))
+    print(f"vecpsmbpo: {text}", file=sys.stderr, flush=True)
+
+
+def warn(what: str) -> None:
+    complain(f"warning: {what}")
 
 
 def of(error: BaseException) -> str:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import sys
 import traceback
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -92,5 +91,5 @@ def train(run: Run, heeding: AbstractContextManager[Stop]) -> Outcome:
 
 
 def _failed(status: int, said: str) -> Outcome:
-    print(f"vecpsmbpo: {said}", file=sys.stderr, flush=True)
+    words.complain(said)
     return Outcome(status, said)
