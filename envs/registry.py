@@ -95,6 +95,15 @@ def resolve_backend(name: str, backend: str = "auto") -> str:
     return backend
 
 
+def check_installed(name: str) -> None:
+    """Raises:
+    SettingError: the suite of the task `name` is not installed.
+    """
+    task = TASKS[name]
+    if not task.installed:
+        raise SettingError(f"env={name}: needs the package {task.suite}; pip install {task.needs or task.suite}")
+
+
 def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0, **options: Any) -> Any:
     """The task `name`.
 
@@ -106,18 +115,20 @@ def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0, 
 
     Raises:
         SettingError: no such task or backend, its suite is not installed, it cannot be learned (images, discrete
-            actions), or whatever its own code raises.
+            actions, none), or whatever its own code raises.
     """
     backend = resolve_backend(name, backend)
-    task = TASKS[name]
-    if not task.installed:
-        raise SettingError(f"env={name}: needs the package {task.suite}; pip install {task.needs or task.suite}")
-    module, attribute = task.code[backend].split(":")
+    check_installed(name)
+    module, attribute = TASKS[name].code[backend].split(":")
+    which = " ".join([f"env={name}", *(f"env.{option}={value}" for option, value in options.items())])
     try:
         found = getattr(importlib.import_module(f"vecpsmbpo.envs.{backend}.{module}"), attribute)
-        return found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **options)
-    except SettingError:
+        made = found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **options)
+        if min(made.spec.obs_size, made.spec.action_size) < 1:
+            sizes = f"{made.spec.obs_size} observation(s) and {made.spec.action_size} action(s)"
+            raise SettingError(f"{which}: has {sizes}; it must have at least one of each")
+    except (SettingError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:
-        which = " ".join([f"env={name}", *(f"env.{option}={value}" for option, value in options.items())])
+    except BaseException as error:  # SystemExit, too, and what a task has of its own
         raise SettingError(f"{which}: cannot be made ({words.of(error)})") from error
+    return made

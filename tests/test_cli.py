@@ -76,6 +76,9 @@ MISTAKES = [
     (["trian"], "trian: no such command"),
     (["train", "-m", "hydra.nosuch=3", "seed=0,1"], "Could not override 'hydra.nosuch'"),
     (["train", "-m", "hydra/launcher=nosuch", "seed=0,1"], "In 'hydra/config': Could not find 'hydra/launcher/nosuch'"),
+    (["train", "-m", "hydra/launcher=null", "seed=0,1"], "hydra/launcher=null: Hydra fails (ValueError: "),
+    (["train", "-m", "hydra=null", "seed=0,1"], "hydra=null: Hydra fails (ValueError: "),
+    (["train", "-m", "hydra.sweeper=null", "seed=0,1"], "hydra.sweeper=null: Hydra fails (RuntimeError: "),
 ]
 
 WITHOUT_JAX = """

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import types
 from pathlib import Path
 
 import jax
@@ -96,7 +97,7 @@ def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(short_run, tmp
     assert evaluate.restore(settings)[1].step == 120
 
 
-def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp_path):
+def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(short_run.run_dir, folder)
     _damage(folder, 120)
@@ -106,6 +107,9 @@ def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp
         training.train(dataclasses.replace(short_run, run_dir=str(folder)))
     assert {name: (folder / name).read_bytes() for name in logs} == logs
     assert {path.name for path in (folder / "checkpoints").iterdir()} >= {"80", "120"}
+    newer, oldest = capsys.readouterr().err.splitlines()
+    assert newer == "vecpsmbpo: warning: the checkpoint at step 120 is damaged; taking the one before it"
+    assert oldest == "vecpsmbpo: warning: the checkpoint at step 80 is damaged"
 
 
 def _flip(path: Path, at: float = 0.5, bit: int = 4) -> None:
@@ -247,6 +251,37 @@ def test_a_simulator_that_fails_in_an_evaluation_costs_no_training(failing, shor
     assert training.train(settings) == 0
     assert capsys.readouterr().err == ""
     assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_simulator_that_fails_at_its_first_reset_leaves_all_as_it_was(
+    begun, short_run, tmp_path, monkeypatch, capsys
+):
+    """Of a new run, and of one that is gone on with."""
+    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
+    if begun:
+        shutil.copytree(short_run.run_dir, tmp_path / "run")
+    before = _files(tmp_path)
+
+    def fails(*_):
+        raise ValueError("no coal")
+
+    monkeypatch.setattr(DmControlSimulator, "load" if begun else "reset", fails)
+    assert training.train(settings) == 1
+    line = (
+        r"vecpsmbpo: ball_in_cup failed before its first step: ValueError: no coal at \S+; nothing has been changed\n"
+    )
+    assert re.fullmatch(line, capsys.readouterr().err)
+    assert _files(tmp_path) == before
+    assert begun or not list(tmp_path.iterdir())
+
+
+def test_a_task_that_cannot_be_made_again_has_failed_in_the_evaluation():
+    def fails(**_):
+        raise SettingError("env=mine: cannot be made")
+
+    with pytest.raises(SimulatorError, match="env=mine: cannot be made"):
+        HostDriver._others(types.SimpleNamespace(_make_env=fails), 1, 0)
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(short_run):

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import importlib.util
 import io
 import os
 import re
@@ -11,16 +12,21 @@ import signal
 import subprocess
 import sys
 
+import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.envs.base import Env, State
 from rich.console import Console
 
 from tests.helpers import command, environment, tiny
 from tools.harm import writes
 from vecpsmbpo import cli, config, envs, runtime, stopping, words
+from vecpsmbpo.envs import registry
 from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
 from vecpsmbpo.settings import SettingError
+from vecpsmbpo.sweeps import launch
 from vecpsmbpo.types import EnvSpec
 
 SUITE = ["env=gymnasium", "backend=host"]
@@ -42,6 +48,17 @@ CARELESS = [
     (["run_dir=${nosuch}"], "Interpolation key 'nosuch' not found"),
     ([f"run_dir={'x' * 300}"], f"run_dir={'x' * 300}: File name too long"),
     (["-m", "seed=0,0"], "seed=0,0: the same value twice"),
+    (["-m", "seed=0,0.0"], "seed=0,0.0: the same value twice"),
+    (["-m", "real_ratio=0,0.0"], "real_ratio=0,0.0: the same value twice"),
+    (["-m", "real_ratio=0.1,0.10000000001"], "real_ratio=0.1,0.10000000001: the same value twice"),
+    (["-m", "total_steps=1e4,10000"], "total_steps=1e4,10000: the same value twice"),
+    (["-m", "real_ratio=0,-0.0"], "real_ratio=0,-0.0: the same value twice"),
+    (["-m", "seed=range(0,0)"], "seed=range(0,0): is a range of no value"),
+    (["-m", "seed=range(0,1e12)"], "seed=range(0,1e12): is a range of more than 10000 values"),
+    (["-m", "seed=range(0,5,0)"], "seed=range(0,5,0): range() arg 3 must not be zero"),
+    (["-m", "size=glob(*)"], "size=glob(*): only a,b,… or choice() and range() can be swept"),
+    (["-m", "seed=interval(0,1)"], "seed=interval(0,1): only a,b,… or choice() and range() can be swept"),
+    (["env='hop\nper'"], r"env=hop\nper: did you mean hopper"),
     *(([*SUITE, f"env.id={wrong}"], "env.id=") for wrong in ("5", "null", "[1,2]", "''", "{a: 1}", "true")),
 ]
 
@@ -69,6 +86,7 @@ TASKS = {
     "class Wants:\n    def __init__(self, x): pass": ":Wants",
     "def fails(): raise KeyError('no')": ":fails",
     "def leaves(): raise SystemExit(0)": ":leaves",
+    "class Odd(BaseException): pass\ndef raises(): raise Odd('no')": ":raises",
     "import nowhere_at_all": ":X",
     "raise RuntimeError('at import')": ":X",
     "def (": ":X",
@@ -89,6 +107,70 @@ def test_a_task_that_cannot_be_made_is_one_line(backend, tmp_path, monkeypatch):
         with pytest.raises(SettingError, match=r"env\.make=careless") as error:
             envs.make("custom", backend, make=make)
         assert "\n" not in str(error.value)
+
+
+class Nothing(gymnasium.Env):
+    """A task in which there is nothing to see, or with `Idle` nothing to do."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (0,))
+    action_space = gymnasium.spaces.Box(-1, 1, (2,))
+
+
+class Idle(Nothing):
+    observation_space, action_space = Nothing.action_space, Nothing.observation_space
+
+
+@pytest.mark.parametrize(("kind", "sizes"), [("Nothing", r"0 obs.* and 2 act"), ("Idle", r"2 obs.* and 0 act")])
+def test_a_task_has_something_to_see_and_to_do(kind, sizes):
+    with pytest.raises(SettingError, match=rf"env\.make=\S+: has {sizes}.*at least one of each"):
+        envs.make("custom", "host", make=f"{__name__}:{kind}")
+
+
+class Stays(Env):
+    """An environment of two numbers in which nothing happens."""
+
+    spec = EnvSpec("stays", 2, 1, 10, None)
+    observation_size, action_size, backend = 2, 1, "none"
+
+    def reset(self, rng):
+        return State(None, jnp.zeros(2), jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state, action):
+        return self.change(state)
+
+
+WRONG_STATES = {
+    "another observation": (lambda state: state.replace(obs=jnp.zeros(3)), r"its step gives obs of shape \(3,\), not"),
+    "a vector of rewards": (lambda state: state.replace(reward=jnp.zeros(1)), r"reward of shape \(1,\), not \(\)"),
+    "a number": (lambda state: 5, "its step gives an array, not a brax.envs.base.State"),
+    "other parts": (lambda state: state.replace(info={"x": 1}), "its step gives a State of other parts"),
+    "another type": (
+        lambda state: state.replace(done=state.done > 0),
+        "gives State.done as bool.*its reset as float32",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "line"), WRONG_STATES.values(), ids=WRONG_STATES)
+def test_a_state_that_a_task_cannot_give_is_one_line(change, line, monkeypatch):
+    monkeypatch.setattr(Stays, "change", lambda self, state: change(state), raising=False)
+    with pytest.raises(SettingError, match=rf"^env\.make=\S+: .*{line}"):
+        envs.make("custom", "mjx", make=f"{__name__}:Stays")
+    monkeypatch.setattr(Stays, "change", lambda self, state: state)
+    assert envs.make("custom", "mjx", make=f"{__name__}:Stays").spec.obs_size == 2
+
+
+@pytest.mark.parametrize("launcher", ["ray", "'ray'", "[ray]"])
+def test_a_launcher_that_is_not_installed_is_one_line(launcher, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SettingError, match=r"needs the package ray; pip install 'vecpsmbpo\[ray\]'"):
+        launch.check(["seed=0,1", f"hydra/launcher={launcher}"])
+
+
+def test_a_suite_that_is_not_installed_is_said_before_jax_is_imported(monkeypatch):
+    monkeypatch.setattr(registry.Task, "installed", False)
+    with pytest.raises(SettingError, match=r"env=brax: needs the package brax; pip install brax"):
+        config.resolve(["env=brax", "env.id=reacher"])
 
 
 def test_an_exception_in_one_line_says_where_it_was_raised():
@@ -157,6 +239,36 @@ def test_the_command_says_so_too(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("variable", "value", "said"),
+    [
+        ("JAX_ENABLE_X64", "foo", "invalid truth value 'foo' for environment 'JAX_ENABLE_X64'"),
+        ("JAX_NUM_CPU_DEVICES", "x", 'Invalid value "x" for JAX flag jax_num_cpu_devices'),
+        ("JAX_DEFAULT_DEVICE", "foo", "jax.default_device must be passed either a Device object"),
+        ("MUJOCO_GL", "foo", "invalid value for environment variable MUJOCO_GL: foo"),
+    ],
+)
+def test_a_variable_that_jax_or_mujoco_refuses_is_one_line(variable, value, said, monkeypatch, capsys):
+    def fail(arguments):
+        raise ValueError(f"{said}\nand more")
+
+    monkeypatch.setattr(cli, "_dispatch", fail)
+    monkeypatch.delenv(variable, raising=False)
+    with pytest.raises(ValueError, match=re.escape(said)):  # nobody has set it: a fault of the program
+        cli.main([])
+    monkeypatch.setenv(variable, value)
+    assert cli.main([]) == 2
+    assert capsys.readouterr().err == f"vecpsmbpo: {variable}={value}: {said}\n"
+
+
+def test_a_value_that_xla_cannot_read_is_one_line(monkeypatch):
+    said = "E1129 01:50:19.87 104 flags.cc:63] Couldn't interpret value x.\nF1129 01:50:19.88 104 env.cc:9] No\nFlags:"
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 1, stderr=said))
+    monkeypatch.setenv("XLA_FLAGS", "--xla_foo=x")
+    with pytest.raises(SettingError, match=r"^XLA_FLAGS=--xla_foo=x: Couldn't interpret value x\.$"):
+        runtime.check_flags()
+
+
 def test_a_flag_that_xla_does_not_know_is_one_line(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(subprocess, "run", pytest.fail)
@@ -210,14 +322,31 @@ def test_a_run_under_nohup_outlives_its_terminal():
         signal.signal(signal.SIGHUP, before)
 
 
-def test_control_c_is_not_lost_in_an_import(tmp_path):
-    program = (
-        "import os, signal, time\nfrom vecpsmbpo import cli\nwith cli._nothing_to_save():\n    try:\n"
-        "        os.kill(os.getpid(), signal.SIGINT)\n        time.sleep(9)\n    except BaseException:\n        pass\n"
-    )
-    arguments = [sys.executable, "-c", program]
-    result = subprocess.run(arguments, env=environment(), capture_output=True, text=True, timeout=60)
+INTERRUPTED = """
+import os, runpy, signal, sys, time
+wanted = sys.argv.pop(1)
+from importlib.abc import MetaPathFinder
+class Interrupting(MetaPathFinder):
+    def find_spec(self, name, *_):
+        if name == wanted:
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(9)
+            except BaseException:
+                pass
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Interrupting())
+runpy.run_module("vecpsmbpo", run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("module", ["vecpsmbpo.cli", "hydra", "jax"])
+def test_control_c_is_not_lost_in_an_import(module, tmp_path):
+    """Of the first of our own, while arguments are understood, and later."""
+    arguments = [sys.executable, "-c", INTERRUPTED, module, "train", "size=tiny"]
+    result = subprocess.run(arguments, env=environment(), cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert (result.returncode, result.stderr) == (130, "vecpsmbpo: interrupted\n")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_reader_that_is_gone_does_not_stop_what_is_printed_to_it(monkeypatch):

@@ -4,12 +4,14 @@ import json
 import signal
 import socket
 import subprocess
+import threading
 import time
 
+import jax
 import pytest
 
 from tests.helpers import argv, environment, without_times
-from vecpsmbpo import cli, jsonl, processes
+from vecpsmbpo import cli, jsonl, processes, training
 from vecpsmbpo.drivers import host
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.settings import SettingError
@@ -160,10 +162,64 @@ def test_a_grid_is_not_one_run(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err == "vecpsmbpo: distributed: is of a single run, and not of a grid (-m)\n"
 
 
-@pytest.mark.parametrize("wrong", ["maybe", "a/0/2", "a:12/2/2", ":12/0/1", "a:12/0", "a:12/0/2/3", "a:1/x/2"])
+@pytest.mark.parametrize(
+    "wrong", ["maybe", "a/0/2", "a:12/2/2", ":12/0/1", "a:12/0", "a:0/0/1", "a:65536/0/1", "a:12/0/2/3", "a:1/x/2"]
+)
 def test_an_address_that_is_none(wrong):
     with pytest.raises(SettingError, match=r"^distributed=.*: must be auto, or host:port/index/processes"):
         processes.join(wrong)
+
+
+@pytest.fixture
+def nobody_comes(monkeypatch):
+    """jax waits until the test is over."""
+    over = threading.Event()
+    monkeypatch.setattr(jax.distributed, "initialize", lambda **_: over.wait())
+    monkeypatch.setattr(processes, "PATIENCE_S", 0.02)
+    monkeypatch.setattr(processes, "SILENCE_S", 0.01)
+    yield
+    over.set()
+
+
+def test_others_that_do_not_come_are_waited_for_and_given_up(nobody_comes, capsys):
+    with socket.socket() as process_0:
+        process_0.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{process_0.getsockname()[1]}"
+
+        def given_up(index):
+            with pytest.raises(processes.NotTogether) as found:
+                processes._initialize("x", processes._address(f"{address}/{index}/2"))
+            waiting = capsys.readouterr().err
+            assert waiting.startswith("vecpsmbpo: waiting for the other processes of the run")
+            assert waiting.count("\n") == 1
+            assert (address in waiting) == bool(index)
+            return str(found.value)
+
+        assert given_up(1) == f"distributed=x: nobody answers at {address}, after 0.02 s"
+        process_0.listen()
+        for index in (0, 1):
+            assert given_up(index) == "distributed=x: the others have not all come, after 0.02 s"
+
+
+def test_processes_that_have_not_come_end_the_program_at_once(monkeypatch, capsys):
+    """The thread that waits for them would hold it up."""
+
+    def alone(settings):
+        raise processes.NotTogether("distributed=x: nobody answers")
+
+    monkeypatch.setattr(training, "train", alone)
+    assert cli._run(None) == (2, False)
+    assert capsys.readouterr().err == "vecpsmbpo: distributed=x: nobody answers\n"
+
+
+def test_without_a_cluster_there_are_no_others_to_be_found(monkeypatch):
+    def fails(*_):
+        raise ValueError("coordinator_address should be defined.")
+
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    monkeypatch.setattr(processes, "_initialize", fails)
+    with pytest.raises(SettingError, match=r"^distributed=auto: jax finds no cluster here"):
+        processes.join("auto")
 
 
 def test_a_task_on_a_device_of_another_process_is_one_line(monkeypatch):

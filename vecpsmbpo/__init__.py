@@ -4,19 +4,28 @@ run = vecpsmbpo.train(env="cartpole_swingup", size="cpu", run_dir="runs/x")
 run = vecpsmbpo.load("runs/x")
 """
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vecpsmbpo.settings import SettingError
-
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from vecpsmbpo.api import Policy, Run
+    from vecpsmbpo.settings import SettingError
 
 __version__ = "0.1.0"
 __all__ = ["SettingError", "load", "train"]
 
 
-# Importing the package imports neither JAX nor MJX, which takes seconds: the command line answers at once.
+# Importing the package imports neither JAX nor MJX, which takes seconds: the command line answers at once. Nor anything
+# else of its own: Ctrl-C is a traceback until `__main__` has come so far as to take care of it.
+
+
+def __getattr__(name: str) -> Any:
+    if name == "SettingError":
+        from vecpsmbpo.settings import SettingError
+
+        return SettingError
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def train(**settings: Any) -> "Run":
@@ -26,7 +35,7 @@ def train(**settings: Any) -> "Run":
     return api.train(**settings)
 
 
-def load(path: str | Path, lane: int = 0) -> "Run | Policy":
+def load(path: "str | Path", lane: int = 0) -> "Run | Policy":
     """The run, or the exported policy, in a directory: see `api.Run` and `api.Policy`."""
     from vecpsmbpo import api
 

@@ -4,14 +4,12 @@ import contextlib
 import importlib
 import io
 import os
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
-from vecpsmbpo import crash, limits
+from vecpsmbpo import crash, interrupt, limits, words
 from vecpsmbpo.settings import SettingError, Settings
 
 HELP = """\
@@ -59,17 +57,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return _dispatch(arguments)
     except SettingError as error:
-        print(f"vecpsmbpo: {error}", file=sys.stderr)
+        words.complain(error)
         return 2
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        print(f"vecpsmbpo: {where}{error.strerror or error}", file=sys.stderr)
+        words.complain(f"{where}{error.strerror or error}")
         return 2
     except MemoryError:
-        print("vecpsmbpo: out of memory", file=sys.stderr)
+        words.complain("out of memory")
         return 2
-    except KeyboardInterrupt:  # before a run heeds signals itself, or a second one
-        print("vecpsmbpo: interrupted", file=sys.stderr)
+    except (ValueError, RuntimeError) as error:
+        if not (line := words.of_environment(error)):
+            raise
+        words.complain(line)
+        return 2
+    except KeyboardInterrupt:  # where no run heeds signals
+        words.complain("interrupted")
         return 130
 
 
@@ -102,36 +105,28 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def _train(overrides: list[str]) -> int:
-    from vecpsmbpo import config
+    with interrupt.leaving(crash.end):
+        from vecpsmbpo import config
 
-    status, in_order = _run(config.resolve(overrides))
+        settings = config.resolve(overrides)
+    status, in_order = _run(settings)
     return status if in_order else _leave(status)
 
 
 @contextlib.contextmanager
-def _nothing_to_save() -> Iterator[None]:
-    """While JAX is imported, for which there is room: Ctrl-C ends the process at once. As an exception it can be lost
-    in a module that is being imported, which catches everything."""
-
-    def leave(number: int, frame: Any) -> None:
-        print("vecpsmbpo: interrupted", file=sys.stderr, flush=True)
-        crash.end()
-        os._exit(130)
-
-    if "jax" in sys.modules or threading.current_thread() is not threading.main_thread():
+def _importing_jax() -> Iterator[None]:
+    """While JAX is imported, for which there is room."""
+    if "jax" in sys.modules:
         yield
         return
     limits.check_start()
-    before = signal.signal(signal.SIGINT, leave)
-    try:
+    with interrupt.leaving(crash.end):
         yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _run(settings: Settings) -> tuple[int, bool]:
     """Trains; the exit status, and whether the process may end as processes do."""
-    with _nothing_to_save():
+    with _importing_jax():
         from vecpsmbpo import processes, runtime
         from vecpsmbpo.training import DiskError, OutOfMemory, train
 
@@ -139,16 +134,20 @@ def _run(settings: Settings) -> tuple[int, bool]:
     try:
         return train(settings), True
     except (DiskError, OutOfMemory, processes.LostProcess, SettingError) as error:
-        if isinstance(error, SettingError) and not processes.are_several():
+        alone = not isinstance(error, processes.NotTogether) and not processes.are_several()
+        if isinstance(error, SettingError) and alone:
             raise
-        print(f"vecpsmbpo: {error}", file=sys.stderr, flush=True)
+        words.complain(error)
         return (1 if isinstance(error, processes.LostProcess) else 2), False
+    except KeyboardInterrupt:  # before a run heeds signals itself, or a second one
+        words.complain("interrupted")
+        return 130, False
 
 
 def _leave(status: int) -> NoReturn:
     """Ends the process at once: the writer threads of orbax would each report the same disk again, in tracebacks of
     their own, while the interpreter ends; there may be no memory for that; and JAX would wait for the processes that
-    have left."""
+    have left, or have not come."""
     crash.end()
     os._exit(status)
 
@@ -159,21 +158,23 @@ class _Task:
     Attributes:
         worst: the exit status of all runs so far, those of a launcher (`hydra_plugins.vecpsmbpo`) included.
         in_order: whether the process may end as processes do.
+        begun: whether Hydra has come as far as the runs.
     """
 
     def __init__(self) -> None:
-        self.worst, self.in_order = 0, True
+        self.worst, self.in_order, self.begun = 0, True, False
 
     def __call__(self, tree: Any) -> None:
         from hydra.core.hydra_config import HydraConfig
 
         from vecpsmbpo import config
 
+        self.begun = True
         try:
             status, in_order = _run(config.resolve(list(HydraConfig.get().overrides.task), tree))
             self.in_order &= in_order
         except SettingError as error:
-            print(f"vecpsmbpo: {error}", file=sys.stderr)
+            words.complain(error)
             status = 2
         if status > 2:
             sys.exit(status)
@@ -186,17 +187,18 @@ def _multirun(overrides: list[str]) -> int:
     A run that cannot be made, or has frozen lanes, does not take the others with it; the exit status is the worst of
     all. A signal stops them all.
     """
-    import hydra
-    from hydra.core.plugins import Plugins
+    with interrupt.leaving(crash.end):
+        import hydra
+        from hydra.core.plugins import Plugins
 
-    from hydra_plugins.vecpsmbpo import Jobs
-    from vecpsmbpo import config
-    from vecpsmbpo.sweeps import launch
-    from vecpsmbpo.sweeps.job import Elsewhere
+        from hydra_plugins.vecpsmbpo import Jobs
+        from vecpsmbpo import config
+        from vecpsmbpo.sweeps import launch
+        from vecpsmbpo.sweeps.job import Elsewhere
 
-    if "distributed" in config.parse(overrides, sweep=True):
-        raise SettingError("distributed: is of a single run, and not of a grid (-m)")
-    launch.check(overrides)
+        if "distributed" in config.parse(overrides, sweep=True):
+            raise SettingError("distributed: is of a single run, and not of a grid (-m)")
+        launch.check(overrides)
     Plugins.instance().register(Jobs)  # by hand, since Hydra finds none in an editable installation
     task = _Task()
     sys.argv = ["vecpsmbpo", "--multirun", *config.for_hydra(overrides)]
@@ -205,8 +207,13 @@ def _multirun(overrides: list[str]) -> int:
         with config.hydra_errors(), warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=r"\s*Running Hydra app with --multirun")
             hydra.main(version_base="1.3", config_path="pkg://vecpsmbpo.configs", config_name="config")(task)()
+    except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        if task.begun:
+            raise
+        given = " ".join(text for text in overrides if "hydra" in text.partition("=")[0])
+        raise SettingError(f"{given or '-m'}: Hydra fails ({words.of(error)})") from None
     except Elsewhere as error:
-        print(f"vecpsmbpo: {error}", file=sys.stderr)
+        words.complain(error)
         return 130
     return task.worst if task.in_order else _leave(task.worst)
 
@@ -221,7 +228,7 @@ def _eval(rest: list[str]) -> int:
     else:
         stored = config.load(run_dir)
         settings = config.for_evaluation(stored, given)
-    with _nothing_to_save():
+    with _importing_jax():
         from vecpsmbpo import runtime
         from vecpsmbpo.evaluate import show
 

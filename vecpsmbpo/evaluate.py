@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from vecpsmbpo import checkpoint, crash, resources, runtime
+from vecpsmbpo import checkpoint, crash, resources, runtime, words
 from vecpsmbpo.drivers import Driver, Returns
 from vecpsmbpo.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.settings import SettingError, Settings
@@ -64,7 +64,7 @@ def restore(stored: Settings) -> tuple[Driver, checkpoint.Saved]:
         SettingError: the run holds no checkpoint, or none of these settings, or there is not enough memory for it.
     """
     with _opened(stored) as (driver, shapes, checkpoints):
-        saved = checkpoints.restore(shapes, driver.layout, warn=_warn)
+        saved = checkpoints.restore(shapes, driver.layout, warn=words.warn)
     if saved is None:
         raise SettingError(f"run_dir={stored.run_dir}: holds no checkpoint yet")
     return driver, saved
@@ -94,7 +94,7 @@ def restore_each(stored: Settings, steps: Collection[int] = ()) -> Iterator[tupl
     if errors and not read:
         raise errors[-1]
     for passed_over in errors:
-        _warn(str(passed_over))
+        words.warn(str(passed_over))
 
 
 @contextlib.contextmanager
@@ -109,7 +109,3 @@ def _opened(stored: Settings) -> Iterator[tuple[Driver, TrainState, checkpoint.C
         yield driver, shapes, checkpoints
     finally:
         checkpoints.close()
-
-
-def _warn(text: str) -> None:
-    print(f"vecpsmbpo: warning: {text}", file=sys.stderr)

@@ -9,7 +9,8 @@ alike. Only the first process writes. With one process nothing here does anythin
 import contextlib
 import functools
 import re
-import sys
+import socket
+import threading
 import zlib
 from collections.abc import Iterator
 from typing import Any
@@ -18,9 +19,11 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from vecpsmbpo import recorded, versions, words
+from vecpsmbpo import crash, recorded, versions, words
 from vecpsmbpo.settings import SettingError, Settings
 
+PATIENCE_S = 300  # for the other processes to come
+SILENCE_S = 1.0  # of that time, before it is said
 LOST_AFTER_S = 30  # without a sign of life, a process counts as lost
 # How collectives say that a peer has gone.
 _GONE = re.compile("gloo|nccl|connection (reset|closed|refused)|unavailable|heartbeat|coordination", re.IGNORECASE)
@@ -28,6 +31,10 @@ _GONE = re.compile("gloo|nccl|connection (reset|closed|refused)|unavailable|hear
 
 class LostProcess(Exception):
     """Another process of the run is gone, or has failed; the last checkpoint is whole."""
+
+
+class NotTogether(SettingError):
+    """The other processes have not come. A thread goes on waiting for them, and ends only with this process."""
 
 
 # ── coming together ──────────────────────────────────────────────────────────────────────────────────────────────
@@ -48,20 +55,72 @@ def join(distributed: str) -> None:
     where = {} if distributed == "auto" else _address(distributed)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.config.update("jax_enable_preemption_service", False)  # SIGTERM is ours (`stopping`)
-    print("waiting for the other processes of the run …", file=sys.stderr, flush=True)
+    crash.doing(f"joining the run{crash.BESIDE_OTHERS}")
     try:
-        jax.distributed.initialize(
-            **where, heartbeat_timeout_seconds=LOST_AFTER_S, shutdown_timeout_seconds=LOST_AFTER_S
-        )
+        _initialize(distributed, where)
     except (RuntimeError, ValueError) as error:
         with contextlib.suppress(RuntimeError):
             jax.distributed.shutdown()
+        if distributed == "auto" and "coordinator_address" in str(error):
+            raise SettingError(
+                "distributed=auto: jax finds no cluster here (Slurm, Open MPI, Kubernetes, a TPU's pod); give "
+                "distributed=host:port/index/processes"
+            ) from None
         raise SettingError(f"distributed={distributed}: {words.of(error)}") from None
+    crash.doing("starting")
+
+
+def _initialize(distributed: str, where: dict[str, Any]) -> None:
+    """Comes back when all processes are there.
+
+    jax waits on a thread: where it waits no signal is heeded, and where its own patience is at an end it ends the
+    process with a page of C++. So it is given more than there will ever be.
+
+    Raises:
+        NotTogether: they are not, after `PATIENCE_S`.
+        RuntimeError, ValueError: what jax raises.
+    """
+    failed: list[Exception] = []
+
+    def wait() -> None:
+        try:
+            jax.distributed.initialize(
+                **where,
+                initialization_timeout=1000 * PATIENCE_S,
+                heartbeat_timeout_seconds=LOST_AFTER_S,
+                shutdown_timeout_seconds=LOST_AFTER_S,
+            )
+        except Exception as error:
+            failed.append(error)
+
+    waiting = threading.Thread(target=wait, daemon=True)
+    waiting.start()
+    waiting.join(SILENCE_S)
+    if waiting.is_alive():
+        address = where.get("coordinator_address")
+        at = f", of which process 0 is to answer at {address}," if where.get("process_id") else ""
+        words.complain(f"waiting for the other processes of the run{at} for up to {PATIENCE_S} s …")
+        waiting.join(PATIENCE_S - SILENCE_S)
+        if waiting.is_alive():
+            what = f"nobody answers at {address}" if at and not _answers(address) else "the others have not all come"
+            raise NotTogether(f"distributed={distributed}: {what}, after {PATIENCE_S} s")
+    if failed:
+        raise failed[0]
+
+
+def _answers(address: str) -> bool:
+    """Whether somebody listens at `host:port`."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=1).close()
+    except OSError:
+        return False
+    return True
 
 
 def _address(distributed: str) -> dict[str, Any]:
     found = re.fullmatch(r"([^/]+:\d+)/(\d+)/(\d+)", distributed, re.ASCII)
-    if not found or int(found[2]) >= int(found[3]):
+    if not found or int(found[2]) >= int(found[3]) or not 0 < int(found[1].rpartition(":")[2]) < 2**16:
         raise SettingError(
             f"distributed={distributed}: must be auto, or host:port/index/processes with index from 0 to processes - 1"
         )

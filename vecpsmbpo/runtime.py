@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -66,8 +67,9 @@ def check_flags() -> None:
         check=False,
     )
     if tried.returncode:
-        said = (tried.stderr.strip() or "XLA does not take them").splitlines()[-1]
-        raise SettingError(f"XLA_FLAGS={flags}: {said.rpartition('] ')[2]}")
+        lines = (tried.stderr.strip() or "XLA does not take them").splitlines()
+        of_xla = [line.rpartition("] ")[2] for line in lines if re.match(r"[EF]\d{4} ", line)]  # before pages of advice
+        raise SettingError(f"XLA_FLAGS={flags}: {[*of_xla, lines[-1]][0]}")
 
 
 def cache_dir() -> Path:

@@ -139,11 +139,16 @@ class HostEnv:
         }
 
     def load(self, saved: dict[str, Any]) -> np.ndarray:
-        """The inverse of `save`: the observations [B, O] that the next actions start from."""
+        """The inverse of `save`: the observations [B, O] that the next actions start from.
+
+        Raises:
+            SimulatorError: one failed.
+        """
         self._lengths = np.array(saved["lengths"], np.int64)
         self._obs = np.array(saved["obs"], np.float32)
-        for simulator, state in zip(self.simulators, saved["simulators"], strict=True):
-            simulator.load(state)
+        with _others_code():
+            for simulator, state in zip(self.simulators, saved["simulators"], strict=True):
+                simulator.load(state)
         return self._obs
 
 
@@ -152,7 +157,7 @@ def _others_code() -> Iterator[None]:
     """Turns whatever a simulator raises, leaving the program included, into one line."""
     try:
         yield
-    except SimulatorError:
+    except (SimulatorError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:  # SystemExit, too, and what a task has of its own
         raise SimulatorError(words.of(error)) from error

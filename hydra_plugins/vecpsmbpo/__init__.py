@@ -28,6 +28,7 @@ class Jobs(Launcher):
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         from vecpsmbpo.sweeps import launch
 
+        self._task.begun = True
         grid = [partial(self._settings, list(overrides)) for overrides in job_overrides]
         status = launch.launch(self._name, self._options, grid)
         self._task.worst = max(self._task.worst, status)

@@ -61,9 +61,16 @@ def check_sweep(name: str, values: Any) -> tuple[float, ...]:
     if not isinstance(values, list | tuple) or not values:
         raise SettingError(f"sweep.{name}={values}: must be a list of values, each {allowed(name)}")
     checked = tuple(check(name, value) for value in values)
-    if len({struct.pack("f", value) for value in checked}) < len(checked):
+    if len({*map(told_apart, checked)}) < len(checked):
         raise SettingError(f"sweep.{name}={list(values)}: two of its values are the same in float32")
     return checked
+
+
+def told_apart(value: Any) -> Any:
+    """By what a checked value differs from others: a real number by its float32, in which there is one zero here."""
+    if isinstance(value, tuple):
+        return tuple(map(told_apart, value))
+    return struct.pack("f", value + 0.0) if isinstance(value, float) and abs(value) <= fields.LARGEST else repr(value)
 
 
 def build(values: Mapping[str, Any]) -> Settings:

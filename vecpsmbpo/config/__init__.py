@@ -3,7 +3,7 @@
 from vecpsmbpo.config.choices import GROUPS, closest, env_options, options
 from vecpsmbpo.config.composing import compose, compose_point, for_hydra, from_tree, hydra_errors
 from vecpsmbpo.config.evaluation import EVALUATION, for_evaluation, parse_evaluation
-from vecpsmbpo.config.overrides import parse
+from vecpsmbpo.config.overrides import chosen, parse
 from vecpsmbpo.config.resuming import resolve
 from vecpsmbpo.config.spelling import as_override, overrides_of
 from vecpsmbpo.config.stored import CONFIG_FILE, from_record, load, save
@@ -13,6 +13,7 @@ __all__ = [
     "EVALUATION",
     "GROUPS",
     "as_override",
+    "chosen",
     "closest",
     "compose",
     "compose_point",

@@ -1,6 +1,7 @@
 """What a command line says, word by word: each `name=value` checked by itself, before anything is composed."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 import yaml
@@ -8,9 +9,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from vecpsmbpo.algorithms.catalogue import FIELDS, check, check_sweep, require
+from vecpsmbpo.algorithms.catalogue import FIELDS, check, check_sweep, require, told_apart
 from vecpsmbpo.config.choices import GROUPS, closest, default, env_options, options
 from vecpsmbpo.settings import SettingError
+
+MOST_VALUES = 10_000  # of one setting in a grid; a typing error may make it endless
 
 
 def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
@@ -42,12 +45,12 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
             continue
         if override.is_sweep_override() and not sweep:
             raise SettingError(f"{text}: several values need -m")
-        values = _sweep_values(override) if override.is_sweep_override() else [override.value()]
-        if len(set(map(str, values))) < len(values):
+        given = _sweep_values(override) if override.is_sweep_override() else [override.value()]
+        values = [check_override(name, value) for value in given]
+        if len(set(map(told_apart, values))) < len(values):
             raise SettingError(f"{text}: the same value twice")
-        for value in values:
-            found[name] = check_override(name, value)
-            algorithms += [str(value)] if name == "algo" else []
+        found[name] = values[-1]
+        algorithms += values if name == "algo" else []
     if "experiment" in found and not sweep:
         raise SettingError(f"experiment={found['experiment']}: is a grid of runs and needs -m")
     _check_env_options(found)
@@ -55,6 +58,13 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
         for algo in algorithms or [default("algo")]:
             check_algorithm(algo, found)
     return found
+
+
+def chosen(group: str, text: str) -> list[str]:
+    """The names that an override chooses of a group of Hydra's, quoted or not; none where it is of something else."""
+    override = OverridesParser.create().parse_override(text)
+    value = override.value() if override.key_or_group == group else []
+    return [str(name) for name in (value if isinstance(value, list) else [value])]
 
 
 def _check_env_options(found: dict[str, Any]) -> None:
@@ -88,7 +98,15 @@ def check_algorithm(algo: str, names: Iterable[str]) -> None:
 
 
 def _sweep_values(override: Override) -> list[Any]:
-    values = list(override.sweep_iterator())
+    try:
+        values = list(islice(override.sweep_iterator(), MOST_VALUES + 1))
+    except HydraException:
+        raise SettingError(f"{override.input_line}: only a,b,… or choice() and range() can be swept") from None
+    except ValueError as error:
+        raise SettingError(f"{override.input_line}: {first_line(error)}") from None
+    if not 0 < len(values) <= MOST_VALUES:
+        count = "no value" if not values else f"more than {MOST_VALUES} values"
+        raise SettingError(f"{override.input_line}: is a range of {count}")
     return [yaml.safe_load(value) if isinstance(value, str) else value for value in values]
 
 

@@ -13,6 +13,7 @@ from vecpsmbpo.config.composing import compose, from_tree
 from vecpsmbpo.config.overrides import check_algorithm, parse
 from vecpsmbpo.config.spelling import DOTTED
 from vecpsmbpo.config.stored import CONFIG_FILE, load
+from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import SettingError, Settings
 
 
@@ -24,10 +25,12 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None) -> Setting
         tree: what Hydra composed of them, where it already has (a job of a multirun).
 
     Raises:
-        SettingError: a mistake in `overrides`, one contradicts the stored run, or a logger is not installed.
+        SettingError: a mistake in `overrides`, one contradicts the stored run, or a logger or the task's suite is not
+            installed.
     """
     settings = _resolved(overrides, tree)
     loggers.check(settings.loggers)
+    registry.check_installed(settings.env)
     return settings
 
 

@@ -63,6 +63,13 @@ class Driver(Protocol):
     layout: Layout
     compile_seconds: float
 
+    def begin(self) -> None:
+        """Begins the first episodes of simulators, where these are not part of the train state; or `init` does.
+
+        Raises:
+            SimulatorError: one failed.
+        """
+
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         """The state before the first step, laid out on the mesh. keys [S], hyper leaves [S]."""
 

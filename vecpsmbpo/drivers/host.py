@@ -67,9 +67,16 @@ class HostDriver:
         )
         self._compiled_evaluation_actions: Any = None
         self._saved_env: dict[str, Any] | None = None  # as the running stride began
+        self._first_obs: np.ndarray | None = None  # from `begin` to `init`
+
+    def begin(self) -> None:
+        self._first_obs = _in_all(self._env.reset)
 
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
-        return self._init(*self.layout.everywhere((keys, hyper, jnp.asarray(self._env.reset())), BY_SEED))
+        if self._first_obs is None:
+            self.begin()
+        obs, self._first_obs = jnp.asarray(self._first_obs), None
+        return self._init(*self.layout.everywhere((keys, hyper, obs), BY_SEED))
 
     def shapes(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         return jax.eval_shape(self._init, keys, hyper, self._shape(self.algorithm.spec.obs_size))
@@ -147,8 +154,7 @@ class HostDriver:
         env_seed = int(jax.random.randint(split.resets[0, 0], (), 0, 2**30))
         split = self.layout.everywhere(split, BY_SEED)
         policies = self._policies(state.seeds, split.policy)
-        env = self._make_env(num_envs=seeds * episodes, seed=env_seed)
-        env.episode_length = self.settings.episode_length
+        env = _in_all(partial(self._others, seeds * episodes, env_seed))
         obs = _in_all(env.reset)
         compiled_for = self._compiled_evaluation_actions if episodes == self.settings.eval_episodes else None
         act, count = compiled_for or self._evaluation_actions, seeds * episodes
@@ -166,6 +172,19 @@ class HostDriver:
             length += alive
             alive &= ~(step.terminated | step.truncated)
         return Returns(total.reshape(seeds, episodes), length.reshape(seeds, episodes))
+
+    def _others(self, num_envs: int, seed: int) -> HostEnv:
+        """Environments to evaluate in.
+
+        Raises:
+            SimulatorError: they cannot be made, though those to train in could.
+        """
+        try:
+            env = self._make_env(num_envs=num_envs, seed=seed)
+        except SettingError as error:
+            raise SimulatorError(str(error)) from error
+        env.episode_length = self.settings.episode_length
+        return env
 
     def save_env(self) -> dict[str, Any]:
         return self._saved_env or self._env.save()

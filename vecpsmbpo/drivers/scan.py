@@ -45,6 +45,9 @@ class ScanDriver:
         self._compiled: Any = None
         self._compiled_evaluate: Any = None
 
+    def begin(self) -> None:
+        pass
+
     def init(self, keys: jax.Array, hyper: Hyper) -> TrainState:
         return self._init(*self.layout.everywhere((keys, hyper), BY_SEED))
 

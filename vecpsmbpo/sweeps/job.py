@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import sys
 import traceback
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -76,10 +75,11 @@ def train(run: Run, heeding: AbstractContextManager[Stop]) -> Outcome:
             from vecpsmbpo import runtime
             from vecpsmbpo.training import DiskError, OutOfMemory
             from vecpsmbpo.training import train as train_here
-        except ImportError as error:
-            return _failed(1, words.of(error))
         except SettingError as error:
             return _failed(2, str(error))
+        except (ImportError, ValueError, RuntimeError) as error:
+            line = words.of_environment(error)
+            return _failed(2, line) if line else _failed(1, words.of(error))
         try:
             runtime.check_flags()
             return Outcome(train_here(run.settings, stop))
@@ -91,5 +91,5 @@ def train(run: Run, heeding: AbstractContextManager[Stop]) -> Outcome:
 
 
 def _failed(status: int, said: str) -> Outcome:
-    print(f"vecpsmbpo: {said}", file=sys.stderr, flush=True)
+    words.complain(said)
     return Outcome(status, said)

@@ -2,12 +2,12 @@
 
 import importlib
 import importlib.util
-import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from vecpsmbpo import config, words
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.sweeps.job import Jobs, Outcome, Run
 
@@ -26,8 +26,9 @@ def check(overrides: Sequence[str]) -> None:
         SettingError: it does.
     """
     for text in overrides:
-        name = text.removeprefix("hydra/launcher=")
-        if text.startswith("hydra/launcher=") and name in LAUNCHERS:
+        for name in config.chosen("hydra/launcher", text):
+            if name not in LAUNCHERS:
+                continue
             package, extra, _, _ = LAUNCHERS[name]
             if importlib.util.find_spec(package) is None:
                 raise SettingError(f"{text}: needs the package {package}; pip install 'vecpsmbpo[{extra}]'")
@@ -56,7 +57,7 @@ def launch(name: str, options: Mapping[str, Any], grid: Sequence[Callable[[], Se
         try:
             runs.append(Run(make(), Path.cwd()))
         except SettingError as error:
-            print(f"vecpsmbpo: {error}", file=sys.stderr)
+            words.complain(error)
             worst = 2
     for run_dir, count in Counter(run.settings.run_dir for run in runs).items():
         if count > 1:

@@ -2,7 +2,6 @@
 
 import contextlib
 import shlex
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -24,6 +23,7 @@ from vecpsmbpo import (
     resources,
     runtime,
     versions,
+    words,
 )
 from vecpsmbpo.drivers import Driver, Interrupted, Returns
 from vecpsmbpo.envs.host.batched import SimulatorError
@@ -57,6 +57,14 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
         LostProcess: another process of the run is gone.
     """
     runtime.configure(settings)
+    try:
+        return _train(settings, stop)
+    except SimulatorError as error:
+        words.complain(f"{settings.task} failed before its first step: {error}; nothing has been changed")
+        return 1
+
+
+def _train(settings: Settings, stop: Stop | None) -> int:
     run_dir = Path(settings.run_dir)
     with processes.noticing_the_lost(), memory_errors(run_dir), contextlib.ExitStack() as around:
         processes.check_same(settings)
@@ -64,6 +72,8 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
             driver = make_driver(settings)
             shapes = driver.shapes(*initial_inputs(settings))
             memory = resources.check_memory(driver.algorithm, shapes)
+        if not _has_checkpoint(run_dir):
+            driver.begin()
         around.enter_context(disk_errors(run_dir))
         with processes.together():
             run_dir.mkdir(parents=True, exist_ok=True)
@@ -94,7 +104,7 @@ class _Session:
         with processes.together():
             self.checkpoints = checkpoint.Checkpoints(self.run_dir / checkpoint.FOLDER, settings, keep=keep)
             opened.callback(self.checkpoints.close)
-            saved = self.checkpoints.restore(shapes, driver.layout, warn=_warn)
+            saved = self.checkpoints.restore(shapes, driver.layout, warn=words.warn)
             if saved and saved.step > settings.total_steps:
                 raise SettingError(f"total_steps={settings.total_steps}: the run has already done {saved.step}")
         if not processes.agree(saved.step if saved else -1):
@@ -115,7 +125,7 @@ class _Session:
                 config.save(settings, self.run_dir)  # now that it is known to be the run's own
                 marks = saved.host.get("logs", {}) if saved else {}
                 self.log = metrics.RunLog(
-                    self.run_dir, self.env_steps, settings, _warn, marks, unevaluated=self.to_evaluate
+                    self.run_dir, self.env_steps, settings, words.warn, marks, unevaluated=self.to_evaluate
                 )
                 opened.callback(self.log.close)
         self.display = Display(driver.algorithm, self.env_steps, None if processes.is_first() else Console(quiet=True))
@@ -251,7 +261,7 @@ class _Session:
             self._save()
         shown = epoch % settings.checkpoint_every == 0 or self.env_steps >= settings.total_steps
         if settings.report and shown and processes.is_first():
-            report.keep(self.run_dir, _warn)
+            report.keep(self.run_dir, words.warn)
 
     def _film(self) -> None:
         """An episode of a run that is complete, where somebody will see it: on its page, or at a logger's server."""
@@ -364,11 +374,9 @@ class _Session:
 
     def _failed(self, where: str, error: Exception) -> int:
         """Says that the task's own code failed; the exit status."""
-        print(
-            f"vecpsmbpo: {self.settings.task} failed {where}: {error}; saved at step {self.saved_step}; to continue: "
-            f"{self._to_continue}",
-            file=sys.stderr,
-            flush=True,
+        words.complain(
+            f"{self.settings.task} failed {where}: {error}; saved at step {self.saved_step}; to continue: "
+            f"{self._to_continue}"
         )
         return 1
 
@@ -385,11 +393,15 @@ def _among(doing: str) -> str:
     return doing + (crash.BESIDE_OTHERS if processes.are_several() else "")
 
 
+def _has_checkpoint(run_dir: Path) -> bool:
+    return any(path.name.isdecimal() for path in (run_dir / checkpoint.FOLDER).glob("*"))
+
+
 def _check_not_emptied(run_dir: Path) -> None:
     """Raises:
     SettingError: there are logs of a run, and no checkpoints: beginning anew would write over them.
     """
-    if not any(path.name.isdecimal() for path in (run_dir / checkpoint.FOLDER).glob("*")):
+    if not _has_checkpoint(run_dir):
         files = (jsonl.METRICS_FILE, jsonl.EPISODES_FILE)
         done = max((line[jsonl.STEP] for name in files for line in metrics.read(run_dir / name)), default=0)
         if done:
@@ -397,7 +409,3 @@ def _check_not_emptied(run_dir: Path) -> None:
                 f"run_dir={run_dir}: its logs reach step {done}, but its checkpoints are gone; put them back, or give "
                 "another run_dir"
             )
-
-
-def _warn(text: str) -> None:
-    print(f"vecpsmbpo: warning: {text}", file=sys.stderr, flush=True)
