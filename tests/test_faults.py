@@ -277,12 +277,12 @@ def test_each_kind_of_write_is_tried():
     kinds = [writes._kind_of_write(f"write {array}/{name}") for name in ("0.0", "0.0.__lock", "1.0", ".zarray")]
     assert kinds == [f"write checkpoints/state/array/{name}" for name in ("part", "part__lock", "part", ".zarray")]
     assert writes._kind_of_write("open .config.4711.yaml") == "open .config.#.yaml"
-    chosen = writes._chosen(["a"] * 5 + ["b"], more=1)
-    assert [what for what, _ in chosen.values()][:4] == [
-        "a, first of 5",
-        "b, first of 1",
-        "a, middle of 5",
-        "a, last of 5",
+    full, broken = errno.ENOSPC, errno.EIO
+    assert writes._chosen(["a", "b", *"aaaa"], more=2) == [
+        (1, "a, first of 5", full),
+        (2, "b, first of 1", broken),
+        (4, "a, middle of 5", full),
+        (6, "a, last of 5", broken),
+        (5, "what is written 75.8% of the way", full),
+        (2, "b, first of 1", full),  # b has met a full disk, too
     ]
-    assert len(chosen) == 5
-    assert {error for _, error in chosen.values()} == {errno.ENOSPC, errno.EIO}
