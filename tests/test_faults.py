@@ -17,6 +17,7 @@ import pytest
 from rich.console import Console
 
 from tests.helpers import command, environment, tiny
+from tools import faults
 from tools.harm import writes
 from vecpsmbpo import cli, config, envs, runtime, stopping, words
 from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
@@ -286,3 +287,24 @@ def test_each_kind_of_write_is_tried():
         (5, "what is written 75.8% of the way", full),
         (2, "b, first of 1", full),  # b has met a full disk, too
     ]
+
+
+def test_the_table_of_faults_has_what_is_tried_and_no_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(faults, "OUT", tmp_path / "faults.csv")
+    row = {"ended": "same end", "commit": "a", "versions": "b"}
+    faults.keep("files", ["of old", "first"], {"what": "of old", **row})
+    faults.keep("twice", ["other"], {"what": "other", **row})
+    for what, ended in (("second", "same end"), ("first", "another end"), ("first", "same end")):
+        faults.keep("files", ["first", "second"], {**row, "what": what, "ended": ended})
+    lines = ["part,what,ended,commit,versions", *(f"{name},same end,a,b" for name in ("files,first", "files,second"))]
+    assert faults.OUT.read_text().splitlines() == [*lines, "twice,other,same end,a,b"]
+
+
+def test_what_a_machine_has_not_for_a_part_of_tools_faults_is_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(faults, "OUT", tmp_path / "faults.csv")
+    monkeypatch.setenv("PATH", str(tmp_path))  # no gcc, no mount, no git
+    assert faults.main(["part=writes,disk"]) == 1
+    writing, mounting = capsys.readouterr().out.splitlines()
+    assert writing.startswith("writes: not tried: needs gcc")
+    assert mounting.startswith("disk: not tried: disks cannot be mounted here (")
+    assert not faults.OUT.exists()

@@ -30,6 +30,7 @@ Parts:
 """
 
 import csv
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -114,9 +115,11 @@ def _code() -> dict[str, str]:
     def git(*words: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(["git", *words], capture_output=True, text=True, check=False)
 
-    commit = git("rev-parse", "--short", "HEAD").stdout.strip() or "unknown"
-    changed = git("diff", "--quiet", "HEAD", "--", *TRIED).returncode
-    return {"commit": commit + "+" * bool(changed), "versions": versions.line()}
+    commit = "unknown"
+    if shutil.which("git") and (found := git("rev-parse", "--short", "HEAD")).returncode == 0:
+        changed = git("diff", "--quiet", "HEAD", "--", *TRIED).returncode
+        commit = found.stdout.strip() + "+" * changed
+    return {"commit": commit, "versions": versions.line()}
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ DISKS_FILES = (3, 20, 40, 60, 80, 100, 120, 140, 160, 200)
 def disk(folder: Path, options: dict) -> Iterator[Trial]:
     small = folder / "disk"
     small.mkdir()
-    with _mounted(small, "size=64k"):  # before anything takes long: it may not be possible
+    with mounted(small, "size=64k"):  # before anything takes long: it may not be possible
         pass
     reference = undisturbed(folder, "host")
     kinds = [(f"size={size}k", f"{size} KiB") for size in DISKS_KB]
@@ -45,7 +45,7 @@ def disk(folder: Path, options: dict) -> Iterator[Trial]:
 
 
 def _filled(small: Path, sizes: str, reference: Path) -> str:
-    with _mounted(small, sizes):
+    with mounted(small, sizes):
         arguments = (*RUN, "backend=host", f"total_steps={END}", f"run_dir={small}/run")
         result = command(*arguments, cwd=small.parent)
         ended = SAME if result.returncode == 0 else one_line(result.returncode, result.stderr)
@@ -57,13 +57,18 @@ def _filled(small: Path, sizes: str, reference: Path) -> str:
 
 
 def _read_only(small: Path, words: list[str]) -> str:
-    with _mounted(small, "ro"):
+    with mounted(small, "ro"):
         result = command(*words, *RUN, "backend=host", cwd=small)
         return one_line(result.returncode, result.stderr)
 
 
 @contextlib.contextmanager
-def _mounted(folder: Path, how: str) -> Iterator[None]:
+def mounted(folder: Path, how: str) -> Iterator[None]:
+    """A disk of its own, of memory.
+
+    Raises:
+        NotTried: that takes root, and a system that knows tmpfs.
+    """
     try:
         subprocess.run(["mount", "-t", "tmpfs", "-o", how, "tmpfs", folder], check=True, capture_output=True, text=True)
     except subprocess.CalledProcessError as error:
