@@ -13,8 +13,9 @@ Parts:
     careless    commands and tasks with a mistake: one line, exit status 2, nothing created
     simulators  tasks that raise, give another shape or leave the program in the middle of a run; then mended, and gone
                 on with
-    files       on both drivers, each file of a run directory truncated, emptied, replaced by noise, one bit flipped;
-                then gone on with. And directories that are not as the run left them: one line, nothing changed
+    files       each file of a run directory, and of a checkpoint of either driver, truncated, emptied, replaced by
+                noise, one bit flipped; then gone on with. And directories that are not as the run left them: one line,
+                nothing changed, and gone on with when they are
     signals     SIGINT, SIGTERM, SIGHUP, and kill -9 ten seconds later; then gone on with. SIGINT while modules are
                 imported
     twice       a second process in the directory of a run
