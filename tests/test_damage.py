@@ -110,7 +110,7 @@ def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp
     *warnings, last = result.stderr.splitlines()
     damaged = "vecpsmbpo: warning: the checkpoint at step {} is damaged; taking the one before it"
     assert warnings == [damaged.format(120), damaged.format(80)]
-    assert last.startswith(f"vecpsmbpo: run_dir={folder}: holds checkpoints, but none that can be read (")
+    assert last.startswith(f"vecpsmbpo: {folder}/checkpoints: holds checkpoints, but none that can be read (")
     assert _files(folder) == before
 
 

@@ -56,7 +56,15 @@ def test_a_run_killed_again_and_again_is_the_undisturbed_run(undisturbed, tmp_pa
     assert_same_run(tmp_path / "run", undisturbed)
 
 
-def test_a_signal_saves_and_says_how_to_go_on(undisturbed, tmp_path):
+@pytest.fixture
+def hanging_up():
+    """SIGHUP is heeded by what is started, also where the tests run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+def test_a_signal_saves_and_says_how_to_go_on(hanging_up, undisturbed, tmp_path):
     """Each of the signals that ask a run to stop, one after the other; then to the same end."""
     arguments, done = SMALL, 0
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -67,7 +75,6 @@ def test_a_signal_saves_and_says_how_to_go_on(undisturbed, tmp_path):
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # where the tests run under nohup, too
         )
         said = ""
         for line in process.stdout:

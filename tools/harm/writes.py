@@ -81,7 +81,7 @@ def _kind_of_write(line: str) -> str:
 
 def _chosen(kinds: list[str], more: int) -> list[tuple[int, str, int]]:
     """Writes by their numbers, from 1; what each is called in the table; and the error that it fails with. The errors
-    alternate, and each kind that has not met a full disk then does, at its first."""
+    alternate; each kind that no full disk meets so meets it at its first, too."""
     found: dict[int, str] = {}
     numbers: dict[str, list[int]] = {}
     for number, kind in enumerate(kinds, start=1):
@@ -90,10 +90,10 @@ def _chosen(kinds: list[str], more: int) -> list[tuple[int, str, int]]:
         for kind, own in numbers.items():
             number = own[{"first": 0, "middle": len(own) // 2, "last": -1}[name]]
             found.setdefault(number, f"{kind}, {name} of {len(own)}")
+    full = {kinds[number - 1] for number, error in zip(found, cycle(ERRORS)) if error == errno.ENOSPC}
     dice = random.Random(0)
     for way in sorted(dice.random() for _ in range(more)):  # not by kind: orbax's threads take turns as they like
         found.setdefault(1 + int(way * len(kinds)), f"what is written {way:.1%} of the way")
     chosen = [(number, what, error) for (number, what), error in zip(found.items(), cycle(ERRORS))]
-    full = {kinds[number - 1] for number, _, error in chosen if error == errno.ENOSPC}
     firsts = [own[0] for kind, own in numbers.items() if kind not in full]
     return [*chosen, *((number, found[number], errno.ENOSPC) for number in firsts)]
