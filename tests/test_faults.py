@@ -21,6 +21,7 @@ from brax.envs.base import Env, State
 from rich.console import Console
 
 from tests.helpers import command, environment, tiny
+from tools import faults
 from tools.harm import writes
 from vecpsmbpo import cli, config, envs, runtime, stopping, words
 from vecpsmbpo.envs import registry
@@ -406,12 +407,33 @@ def test_each_kind_of_write_is_tried():
     kinds = [writes._kind_of_write(f"write {array}/{name}") for name in ("0.0", "0.0.__lock", "1.0", ".zarray")]
     assert kinds == [f"write checkpoints/state/array/{name}" for name in ("part", "part__lock", "part", ".zarray")]
     assert writes._kind_of_write("open .config.4711.yaml") == "open .config.#.yaml"
-    chosen = writes._chosen(["a"] * 5 + ["b"], more=1)
-    assert [what for what, _ in chosen.values()][:4] == [
-        "a, first of 5",
-        "b, first of 1",
-        "a, middle of 5",
-        "a, last of 5",
+    full, broken = errno.ENOSPC, errno.EIO
+    assert writes._chosen(["a", "b", *"aaaa"], more=2) == [
+        (1, "a, first of 5", full),
+        (2, "b, first of 1", broken),
+        (4, "a, middle of 5", full),
+        (6, "a, last of 5", broken),
+        (5, "what is written 75.8% of the way", full),
+        (2, "b, first of 1", full),  # b has met a full disk, too
     ]
-    assert len(chosen) == 5
-    assert {error for _, error in chosen.values()} == {errno.ENOSPC, errno.EIO}
+
+
+def test_the_table_of_faults_has_what_is_tried_and_no_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(faults, "OUT", tmp_path / "faults.csv")
+    row = {"ended": "same end", "commit": "a", "versions": "b"}
+    faults.keep("files", ["of old", "first"], {"what": "of old", **row})
+    faults.keep("twice", ["other"], {"what": "other", **row})
+    for what, ended in (("second", "same end"), ("first", "another end"), ("first", "same end")):
+        faults.keep("files", ["first", "second"], {**row, "what": what, "ended": ended})
+    lines = ["part,what,ended,commit,versions", *(f"{name},same end,a,b" for name in ("files,first", "files,second"))]
+    assert faults.OUT.read_text().splitlines() == [*lines, "twice,other,same end,a,b"]
+
+
+def test_what_a_machine_has_not_for_a_part_of_tools_faults_is_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(faults, "OUT", tmp_path / "faults.csv")
+    monkeypatch.setenv("PATH", str(tmp_path))  # no gcc, no mount, no git
+    assert faults.main(["part=writes,disk"]) == 1
+    writing, mounting = capsys.readouterr().out.splitlines()
+    assert writing.startswith("writes: not tried: needs gcc")
+    assert mounting.startswith("disk: not tried: disks cannot be mounted here (")
+    assert not faults.OUT.exists()

@@ -1,6 +1,7 @@
 """One run over several processes, on this machine: the same as in one process with as many devices, to the bit."""
 
 import json
+import shutil
 import signal
 import socket
 import subprocess
@@ -8,6 +9,7 @@ import threading
 import time
 
 import jax
+import numpy as np
 import pytest
 
 from tests.helpers import argv, environment, without_times
@@ -71,21 +73,37 @@ def check_same_end(several, one):
         assert without_times(jsonl.read(several / name)) == without_times(jsonl.read(one / name))
 
 
+def check_nearly_same_end(run_dir, other):
+    """The state to the bit, and what is logged of it but for means over members, whose sums are in another order."""
+    assert arrays(run_dir) == arrays(other)
+    assert jsonl.read(run_dir / jsonl.EPISODES_FILE) == jsonl.read(other / jsonl.EPISODES_FILE)
+    both = (without_times(jsonl.read(path / jsonl.METRICS_FILE)) for path in (run_dir, other))
+    for line, others in zip(*both, strict=True):
+        assert line.keys() == others.keys()
+        numbers = [[np.nan if value is None else value for value in one.values()] for one in (line, others)]
+        np.testing.assert_allclose(*numbers, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
-    ("env", "backend", "devices", "begun"), [("ball_in_cup", "host", 2, 80), ("cartpole_swingup", "mjx", 1, 120)]
+    ("env", "backend", "seeds", "devices", "begun"),
+    [("ball_in_cup", "host", 2, 2, 80), ("cartpole_swingup", "mjx", 2, 1, 120), ("ball_in_cup", "host", 1, 1, 120)],
+    ids=["members within processes", "seeds across processes", "members across processes"],
 )
-def test_several_processes_are_one_with_as_many_devices(env, backend, devices, begun, start, tmp_path):
-    """Also where one goes on with what several have begun."""
-    count, task = 2, (f"env={env}", f"backend={backend}", "num_seeds=2")
+def test_several_processes_are_one_with_as_many_devices(env, backend, seeds, devices, begun, start, tmp_path):
+    """Also where one goes on with what several have begun, on as many devices or on half of them."""
+    count, task = 2, (f"env={env}", f"backend={backend}", f"num_seeds={seeds}")
     ended = end(start(count, *task, f"total_steps={begun}", "run_dir=several", devices=devices))
     assert [status for status, _, _ in ended] == [0] * count, ended
     said = [output for _, output, _ in ended]
     assert f"on {count * devices} cpu device(s)" in said[0]
     assert f"saved at step {begun}" in said[0]
     assert not any("step" in others for others in said[1:])  # the first one speaks (and Gloo, for all)
-    if begun < 120:
-        alone(count * devices, tmp_path, *task, "total_steps=120", "run_dir=several")
     alone(count * devices, tmp_path, *task, "total_steps=120", "run_dir=alone")
+    if begun < 120:
+        shutil.copytree(tmp_path / "several", tmp_path / "fewer")
+        for run_dir, left in (("several", count * devices), ("fewer", devices)):
+            alone(left, tmp_path, *task, "total_steps=120", f"run_dir={run_dir}")
+        check_nearly_same_end(tmp_path / "fewer", tmp_path / "alone")
     check_same_end(tmp_path / "several", tmp_path / "alone")
     assert "distributed: ''" in (tmp_path / "several" / "config.yaml").read_text()
 
@@ -107,14 +125,14 @@ LONG = ("env=ball_in_cup", "backend=host", "total_steps=1000000", "run_dir=run")
 
 @pytest.fixture
 def begun(start, tmp_path):
-    """Starts a long run of two processes, or goes on with it, and waits for three epochs."""
+    """Starts a long run of two processes, or goes on with it, and waits for an epoch."""
 
     def begin():
         epochs = tmp_path / "run" / jsonl.METRICS_FILE
         before = len(jsonl.read(epochs)) if epochs.exists() else 0
         running = start(2, *LONG)
         deadline = time.monotonic() + 300
-        while not epochs.exists() or len(jsonl.read(epochs)) < before + 3:
+        while not epochs.exists() or len(jsonl.read(epochs)) == before:
             assert all(process.poll() is None for process in running)
             assert time.monotonic() < deadline
             time.sleep(0.2)
@@ -123,25 +141,36 @@ def begun(start, tmp_path):
     return begin
 
 
-@pytest.mark.slow
-def test_where_one_is_gone_the_others_end_and_a_signal_to_one_stops_all(begun, tmp_path):
-    for lost, said in ((1, "another process of the run is gone"), (0, "another process of the run")):
-        running = begun()
-        running[lost].kill()
-        status, _, errors = end(running)[1 - lost]
-        told = [line for line in errors.splitlines() if line.startswith("vecpsmbpo: ")]
-        assert status != 0
-        assert len(told) == 1, errors
-        assert said in told[0]
-        assert "same command again" in told[0]
+def check_last_words(running, lost):
+    """Of the one that is left, on stderr: a line, besides what it has waited for at the start."""
+    status, _, errors = end(running)[1 - lost]
+    assert status != 0
+    assert errors.count("\n") == 2, errors
+    waiting, line = errors.splitlines()
+    assert waiting.startswith("waiting for")
+    assert line.startswith("vecpsmbpo: another process of the run")
+    assert "same command again" in line
 
-    running = begun()  # from the last checkpoint
+
+def test_a_signal_to_one_stops_all_and_where_one_is_gone_the_other_ends(begun, tmp_path):
+    running = begun()
     running[1].send_signal(signal.SIGTERM)
     ended = end(running)
     assert [status for status, _, _ in ended] == [128 + signal.SIGTERM] * 2, ended
     assert "to continue: the same command again" in ended[0][1]
     steps = max(int(path.name) for path in (tmp_path / "run" / "checkpoints").iterdir())
     assert jsonl.read(tmp_path / "run" / jsonl.EPISODES_FILE)[-1]["env_steps"] <= steps
+
+    running = begun()  # from there
+    running[1].kill()
+    check_last_words(running, lost=1)
+
+
+@pytest.mark.slow
+def test_where_the_first_one_is_gone_the_other_ends(begun):
+    running = begun()
+    running[0].kill()
+    check_last_words(running, lost=0)
 
 
 def test_what_fails_in_one_fails_in_all(start, tmp_path):

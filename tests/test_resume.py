@@ -11,7 +11,7 @@ import pytest
 
 import vecpsmbpo
 from tests.helpers import argv, assert_probabilities_follow, assert_same_run, command, environment
-from vecpsmbpo import config, metrics
+from vecpsmbpo import config, metrics, stopping
 from vecpsmbpo.settings import SettingError
 
 SMALL = ["env=cartpole_swingup", "size=tiny", "num_seeds=2", "total_steps=200"]
@@ -56,31 +56,43 @@ def test_a_run_killed_again_and_again_is_the_undisturbed_run(undisturbed, tmp_pa
     assert_same_run(tmp_path / "run", undisturbed)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_saves_and_says_how_to_go_on(number, undisturbed, tmp_path):
-    process = subprocess.Popen(
-        argv("train", *SMALL, "run_dir=run", one_thread=True),
-        cwd=tmp_path,
-        env=environment(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    said = ""
-    for line in process.stdout:
-        said += line
-        if line.startswith("step"):
-            process.send_signal(number)
-            break
-    rest, errors = process.communicate(timeout=300)
-    assert process.returncode == 128 + number, errors
-    assert "to continue: vecpsmbpo train run_dir=run" in said + rest
-    assert "Traceback" not in errors
-    saved = int(re.search(r"saved at step (\d+) of 200", said + rest).group(1))
-    assert 0 < saved < 200
+@pytest.fixture
+def hanging_up():
+    """SIGHUP is heeded by what is started, also where the tests run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+def test_a_signal_saves_and_says_how_to_go_on(hanging_up, undisturbed, tmp_path):
+    """Each of the signals that ask a run to stop, one after the other; then to the same end."""
+    arguments, done = SMALL, 0
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        process = subprocess.Popen(
+            argv("train", *arguments, "run_dir=run", one_thread=True),
+            cwd=tmp_path,
+            env=environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        said = ""
+        for line in process.stdout:
+            said += line
+            if "compiled in" in line:
+                process.send_signal(number)
+                break
+        rest, errors = process.communicate(timeout=300)
+        assert process.returncode == 128 + number, errors
+        assert errors.strip() == stopping.FINISHING
+        assert f"resuming at step {done}" in said or not done
+        assert "to continue: vecpsmbpo train run_dir=run" in said + rest
+        saved = int(re.search(r"saved at step (\d+) of 200", said + rest).group(1))
+        assert done < saved < 200
+        arguments, done = [], saved
     result = command("train", "run_dir=run", cwd=tmp_path, one_thread=True)
     assert result.returncode == 0, result.stderr
-    assert f"resuming at step {saved}" in result.stdout
+    assert f"resuming at step {done}" in result.stdout
     assert_same_run(tmp_path / "run", undisturbed)
 
 

@@ -99,3 +99,14 @@ def test_a_limit_on_address_space_is_one_line_before_anything_is_made(limit_mb, 
     assert result.stderr.startswith(f"vecpsmbpo: {line}")
     assert result.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_too_few_open_files_are_one_line(tmp_path):
+    limited = (
+        f"ulimit -n 16; exec {sys.executable} -m vecpsmbpo.cli train env=ball_in_cup size=tiny backend=host run_dir=x"
+    )
+    result = subprocess.run(["bash", "-c", limited], cwd=tmp_path, env=environment(), capture_output=True, text=True)
+    assert (result.returncode, result.stderr) == (
+        2,
+        f"vecpsmbpo: run_dir=x: cannot be written ({os.strerror(errno.EMFILE)})\n",
+    )

@@ -1,7 +1,6 @@
 """Whole episodes of a trained run's policies: what `vecpsmbpo eval` shows and `Run.evaluate` returns."""
 
 import contextlib
-import sys
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -5,35 +5,70 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
-from tools.harm.runs import END, RUN, Found, command, one_line, said_until, same_end, started, undisturbed
+from tools.harm.runs import (
+    END,
+    ONE_LINE,
+    RUN,
+    SAME,
+    Trial,
+    command,
+    one_line,
+    said_until,
+    same_end,
+    started,
+    undisturbed,
+)
 from vecpsmbpo import checkpoint
 
 TO_LIVE_S = 10.0
+# After the start of a process: Python itself is up by the first, and training begins after the last.
+IMPORTING_S = (0.4, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5)
+KILLS = 5  # of a trial
 
 
-def signals(folder: Path, options: dict) -> Iterator[Found]:
+def signals(folder: Path, options: dict) -> Iterator[Trial]:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # a run inherits what nohup makes of it, and heeds that
     reference = undisturbed(folder, "host")
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         name = signal.Signals(number).name
-        process = started(*RUN, "backend=host", f"total_steps={END}", f"run_dir={name}", cwd=folder)
-        said_until(process, "step")
-        process.send_signal(number)
-        try:
-            said, errors = process.communicate(timeout=TO_LIVE_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            said, errors = process.communicate()
-        command(f"run_dir={name}", cwd=folder)
-        ended = same_end(folder / name, reference)
-        if process.returncode != 128 + number or "to continue: " not in said:
-            ended = f"{ended}, but status {process.returncode}: {errors[-200:]!r}"
-        yield f"{name}, killed {TO_LIVE_S:.0f} s later", ended
+        yield f"{name}, killed {TO_LIVE_S:.0f} s later", partial(_asked_to_stop, folder / name, number, reference)
+    for after in IMPORTING_S:
+        yield f"SIGINT {after} s after the start", partial(_interrupted, folder, after)
 
 
-def twice(folder: Path, options: dict) -> Iterator[Found]:
+def _asked_to_stop(run_dir: Path, number: signal.Signals, reference: Path) -> str:
+    folder = run_dir.parent
+    process = started(*RUN, "backend=host", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
+    said_until(process, "step")
+    process.send_signal(number)
+    try:
+        said, errors = process.communicate(timeout=TO_LIVE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        said, errors = process.communicate()
+    command(f"run_dir={run_dir}", cwd=folder)
+    ended = same_end(run_dir, reference)
+    if process.returncode != 128 + number or "to continue: " not in said:
+        ended = f"{ended}, but status {process.returncode}: {errors[-200:]!r}"
+    return ended
+
+
+def _interrupted(folder: Path, after_s: float) -> str:
+    process = started(*RUN, "backend=host", "run_dir=early", cwd=folder)
+    time.sleep(after_s)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate()
+    return "it has begun" if (folder / "early").exists() else one_line(process.returncode, errors, expected=130)
+
+
+def twice(folder: Path, options: dict) -> Iterator[Trial]:
+    yield "a second process is refused, and the first one not disturbed", partial(_second, folder)
+
+
+def _second(folder: Path) -> str:
     arguments = (*RUN, "backend=host", f"total_steps={END}", "run_dir=run")
     first = started(*arguments, cwd=folder)
     said_until(first, "compiling")
@@ -41,41 +76,55 @@ def twice(folder: Path, options: dict) -> Iterator[Found]:
     second = command(*arguments, cwd=folder)
     first.send_signal(signal.SIGCONT)
     first.communicate()
-    yield "the second process", one_line(second.returncode, second.stderr)
-    yield "the first process", same_end(folder / "run", undisturbed(folder, "host"))
+    ended = one_line(second.returncode, second.stderr)
+    return same_end(folder / "run", undisturbed(folder, "host")) if ended == ONE_LINE else ended
 
 
-def kills(folder: Path, options: dict) -> Iterator[Found]:
-    dice = random.Random(0)
+def kills(folder: Path, options: dict) -> Iterator[Trial]:
     for backend in ("host", "mjx"):
+        run = (*RUN, f"backend={backend}", f"total_steps={END}")
         reference = undisturbed(folder, backend)  # which compiles, and the runs after it do not
         began = time.perf_counter()
-        command(*RUN, f"backend={backend}", f"total_steps={END}", f"run_dir={backend}0", cwd=folder)
-        longest, done, runs = time.perf_counter() - began, 0, 0
-        while done < options["kills"]:
-            runs += 1
-            run_dir, before, saving = folder / f"{backend}{runs}", done, 0
-            while True:
-                process = started(*RUN, f"backend={backend}", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
-                if done == options["kills"]:
-                    process.communicate()
-                    break
-                if done % 5 == 0 and in_a_save(process, run_dir):
-                    saving += 1
-                else:
-                    try:
-                        process.communicate(timeout=dice.uniform(0, longest))
-                        break
-                    except subprocess.TimeoutExpired:
-                        pass
-                process.kill()
-                process.communicate()
-                done += 1
-            what = f"{backend}: {done - before} kills of run {runs}, {saving} of them in a save"
-            yield what, same_end(run_dir, reference)
+        command(*run, f"run_dir={backend}", cwd=folder)
+        longest = time.perf_counter() - began
+        for done in range(0, options["kills"], KILLS):
+            of = range(done + 1, min(done + KILLS, options["kills"]) + 1)
+            what = f"{backend}: kills {of[0]} to {of[-1]}, the first in a save"
+            yield what, partial(_killed, folder / f"{backend}{done}", run, len(of), longest, reference)
 
 
-def in_a_save(process: subprocess.Popen, run_dir: Path) -> bool:
+def _killed(run_dir: Path, run: tuple[str, ...], count: int, longest: float, reference: Path) -> str:
+    """So many times, in as many runs as that takes; all of them have to end well."""
+    dice, done, number, ended = random.Random(run_dir.name), 0, 0, SAME
+    while done < count and ended == SAME:
+        number += 1
+        own = run_dir.with_name(f"{run_dir.name}_{number}")
+        again = (*run, f"run_dir={own}")
+        while done < count and _kill(started(*again, cwd=own.parent), own, dice.uniform(0, longest), done == 0):
+            done += 1
+        if done == count:
+            command(*again, cwd=own.parent)
+        ended = same_end(own, reference)
+    return ended
+
+
+def _kill(process: subprocess.Popen, run_dir: Path, after_s: float, in_a_save: bool) -> bool:
+    """False where the process ends before."""
+    if in_a_save:
+        if not _saving(process, run_dir):
+            return False
+    else:
+        try:
+            process.communicate(timeout=after_s)
+            return False
+        except subprocess.TimeoutExpired:
+            pass
+    process.kill()
+    process.communicate()
+    return True
+
+
+def _saving(process: subprocess.Popen, run_dir: Path) -> bool:
     """Waits until a checkpoint is being written beside its place; False where the process ends before."""
     while process.poll() is None:
         if any(run_dir.glob(f"{checkpoint.FOLDER}/*orbax-checkpoint-tmp*")):

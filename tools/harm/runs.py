@@ -1,21 +1,24 @@
 """A tiny run, how it is started, and how it has ended."""
 
 import contextlib
-import io
 import json
 import os
 import re
 import resource
 import subprocess
-from collections.abc import Mapping
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
+from typing import TextIO
 
 from tests.helpers import argv, without_times
 from vecpsmbpo import cli, jsonl
 
-RUN = ["size=tiny", "env=ball_in_cup", "loggers=[]"]  # 40 steps an epoch, a checkpoint each
+LOGGED = ["size=tiny", "env=ball_in_cup"]  # 40 steps an epoch, a checkpoint each
+RUN = [*LOGGED, "loggers=[]"]
 STOPPED, END = 120, 160
 ANSWER_S = 100
 # The last words of C++, LLVM, XLA, and of a Python that has no memory for others.
@@ -23,9 +26,14 @@ NATIVE = re.compile(
     r"terminate called|  what\(\):  |LLVM ERROR: |[EF]\d{4} [\d:.]+ +\d+ \w+\.cc:\d+\] "
     r"|Exception ignored in sys\.unraisablehook|MemoryError$"
 )
-Found = tuple[str, str]  # what was tried, and how it ended: FINE or what was wrong
 SAME, SAID, ONE_LINE = "same end", "same state, lost lines are said", "one line"
 FINE = (SAME, SAID, ONE_LINE)
+# What is tried, and what tries it and returns how it ended: one of FINE, or what was wrong.
+Trial = tuple[str, Callable[[], str]]
+
+
+class NotTried(Exception):
+    """What this machine lacks for a part."""
 
 
 def environment() -> dict[str, str]:
@@ -55,6 +63,12 @@ def same_end(run_dir: Path, undisturbed: Path) -> str:
     return SAME if lines(run_dir) == lines(undisturbed) else "other logs"
 
 
+def warned_end(errors: str, run_dir: Path, undisturbed: Path) -> str:
+    """As `same_end`, of a run that may say nothing on stderr but warnings of its own."""
+    others = [line for line in errors.splitlines() if not line.startswith("vecpsmbpo: warning: ")]
+    return f"status 0, and besides {' '.join(others)[-200:]!r}" if others else same_end(run_dir, undisturbed)
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -72,14 +86,30 @@ def one_line(status: int, errors: str, expected: int | None = 2) -> str:
 
 def here(arguments: list[str]) -> tuple[int, str]:
     """A command in this process, which has compiled the program already: its exit status and what it said."""
-    said = io.StringIO()
-    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+    with _silenced(1), _silenced(2) as said:
         try:
             status = cli.main(["train", *arguments])
         except BaseException as error:  # the fault that is looked for
-            said.write(repr(error))
+            print(repr(error), file=sys.stderr)
             status = -1
-    return status, said.getvalue()
+        sys.stderr.flush()
+        said.seek(0)
+        return status, said.read()
+
+
+@contextlib.contextmanager
+def _silenced(descriptor: int) -> Iterator[TextIO]:
+    """Where all goes meanwhile that is written to stdout or stderr: also by libraries, which do not ask Python."""
+    stream, before = {1: sys.stdout, 2: sys.stderr}[descriptor], os.dup(descriptor)
+    stream.flush()
+    try:
+        with tempfile.TemporaryFile("w+", errors="replace") as file:
+            os.dup2(file.fileno(), descriptor)
+            yield file
+            stream.flush()
+    finally:
+        os.dup2(before, descriptor)
+        os.close(before)
 
 
 def command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess:

@@ -5,50 +5,66 @@ import random
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
+from functools import partial
+from itertools import cycle
 from pathlib import Path
 
-from tools.harm.runs import END, ONE_LINE, RUN, Found, errors_of, here, one_line, same_end, started
+from tools.harm.runs import (
+    END,
+    LOGGED,
+    ONE_LINE,
+    NotTried,
+    Trial,
+    errors_of,
+    here,
+    one_line,
+    same_end,
+    started,
+    warned_end,
+)
 
 SHIM = Path(__file__).with_name("writes.c")
+ERRORS = (errno.ENOSPC, errno.EIO)
+# With a logger, which writes, too; and on all cores, as the runs of this process that go on.
+LOGGING = [*LOGGED, "loggers=[tensorboard]", "backend=host", f"total_steps={END}"]
 
 
-def writes(folder: Path, options: dict) -> Iterator[Found]:
-    if shutil.which("gcc") is None:
-        print("writes: not tried: there is no gcc here")
-        return
-    shim = folder / "writes.so"
+def writes(folder: Path, options: dict) -> Iterator[Trial]:
+    if sys.platform != "linux" or shutil.which("gcc") is None:
+        raise NotTried("needs gcc and Linux's LD_PRELOAD")
+    shim, reference = folder / "writes.so", folder / "reference"
     subprocess.run(["gcc", "-shared", "-fPIC", "-O2", "-o", shim, SHIM, "-ldl"], check=True)
-    # With a logger, which writes, too; and on all cores, as the runs of this process that go on.
-    run = [*RUN[:-1], "loggers=[tensorboard]", "backend=host", f"total_steps={END}"]
-
-    def begun(run_dir: Path, **told: object) -> tuple[int, str]:
-        surroundings = {"LD_PRELOAD": str(shim), "WRITES_BELOW": str(run_dir), "WRITES_LOG": f"{run_dir}.log"}
-        surroundings |= {f"WRITES_{name.upper()}": str(value) for name, value in told.items()}
-        process = started(*run, f"run_dir={run_dir}", cwd=folder, one_thread=False, surroundings=surroundings)
-        errors = errors_of(process)
-        return process.returncode, errors
-
-    reference = folder / "reference"
-    status, errors = begun(reference)
-    assert (status, errors) == (0, ""), errors
+    assert _begun(shim, reference) == (0, "")
     seen = Path(f"{reference}.log").read_text().splitlines()
     chosen = _chosen([_kind_of_write(line) for line in seen], options["writes"])
-    which, of = map(int, options["portion"].split("/"))
     print(f"writes: {len(seen)} of an undisturbed run, {len(chosen)} of them tried", flush=True)
-    for number, (what, error) in list(chosen.items())[len(chosen) * (which - 1) // of : len(chosen) * which // of]:
-        run_dir = folder / "disturbed"
-        status, errors = begun(run_dir, fail=number, error=error)
-        if status == 0:
-            others = [line for line in errors.splitlines() if not line.startswith("vecpsmbpo: warning: ")]
-            ended = same_end(run_dir, reference) if not others else f"status 0, and besides {' '.join(others)[-200:]!r}"
-        else:
-            ended = one_line(status, errors)
-            if ended == ONE_LINE:
-                status, errors = here([*run, f"run_dir={run_dir}"])
-                ended = same_end(run_dir, reference) if status == 0 else f"not gone on with: {errors[-200:]!r}"
-        shutil.rmtree(run_dir, ignore_errors=True)
-        yield f"{what} fails with {errno.errorcode[error]}", ended
+    for number, what, error in chosen:
+        attempt = partial(_disturbed, shim, folder / "disturbed", number, error, reference)
+        yield f"{what} fails with {errno.errorcode[error]}", attempt
+
+
+def _begun(shim: Path, run_dir: Path, **told: int) -> tuple[int, str]:
+    """Exit status and stderr."""
+    surroundings = {"LD_PRELOAD": str(shim), "WRITES_BELOW": str(run_dir), "WRITES_LOG": f"{run_dir}.log"}
+    surroundings |= {f"WRITES_{name.upper()}": str(value) for name, value in told.items()}
+    process = started(*LOGGING, f"run_dir={run_dir}", cwd=run_dir.parent, one_thread=False, surroundings=surroundings)
+    errors = errors_of(process)
+    return process.returncode, errors
+
+
+def _disturbed(shim: Path, run_dir: Path, number: int, error: int, reference: Path) -> str:
+    status, errors = _begun(shim, run_dir, fail=number, error=error)
+    if status == 0:
+        ended = warned_end(errors, run_dir, reference)
+    else:
+        ended = one_line(status, errors)
+        if ended == ONE_LINE:
+            status, errors = here([*LOGGING, f"run_dir={run_dir}"])
+            ended = same_end(run_dir, reference) if status == 0 else f"not gone on with: {errors[-200:]!r}"
+    shutil.rmtree(run_dir, ignore_errors=True)
+    return ended
 
 
 def _kind_of_write(line: str) -> str:
@@ -63,8 +79,9 @@ def _kind_of_write(line: str) -> str:
     return f"{what} {re.sub(r'[0-9]+', '#', kind) or '.'}"
 
 
-def _chosen(kinds: list[str], more: int) -> dict[int, tuple[str, int]]:
-    """By number, from 1: what a write is called in the table, and the error that it fails with; they alternate."""
+def _chosen(kinds: list[str], more: int) -> list[tuple[int, str, int]]:
+    """Writes by their numbers, from 1; what each is called in the table; and the error that it fails with. The errors
+    alternate; each kind that no full disk meets so meets it at its first, too."""
     found: dict[int, str] = {}
     numbers: dict[str, list[int]] = {}
     for number, kind in enumerate(kinds, start=1):
@@ -73,8 +90,10 @@ def _chosen(kinds: list[str], more: int) -> dict[int, tuple[str, int]]:
         for kind, own in numbers.items():
             number = own[{"first": 0, "middle": len(own) // 2, "last": -1}[name]]
             found.setdefault(number, f"{kind}, {name} of {len(own)}")
-    rest = [number for number in range(1, len(kinds) + 1) if number not in found]
-    for number in sorted(random.Random(0).sample(rest, min(more, len(rest)))):
-        found[number] = f"{kinds[number - 1]}, write {number} of all"
-    errors = (errno.ENOSPC, errno.EIO)
-    return {number: (what, errors[index % 2]) for index, (number, what) in enumerate(found.items())}
+    full = {kinds[number - 1] for number, error in zip(found, cycle(ERRORS)) if error == errno.ENOSPC}
+    dice = random.Random(0)
+    for way in sorted(dice.random() for _ in range(more)):  # not by kind: orbax's threads take turns as they like
+        found.setdefault(1 + int(way * len(kinds)), f"what is written {way:.1%} of the way")
+    chosen = [(number, what, error) for (number, what), error in zip(found.items(), cycle(ERRORS))]
+    firsts = [own[0] for kind, own in numbers.items() if kind not in full]
+    return [*chosen, *((number, found[number], errno.ENOSPC) for number in firsts)]

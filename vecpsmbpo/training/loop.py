@@ -270,9 +270,9 @@ class _Session:
         if not seen or self.env_steps < settings.total_steps or settings.plans_actions or not processes.is_first():
             return
         self.display.say("filming an episode …")
-        render.keep(self.run_dir, _warn)
+        render.keep(self.run_dir, words.warn)
         if settings.report:
-            report.keep(self.run_dir, _warn)
+            report.keep(self.run_dir, words.warn)
 
     def _lines(self, returns: Returns, seconds: float) -> list[metrics.Line]:
         rates = Rates.over(self.driver.algorithm, self.env_steps, self.epoch_steps_done, seconds)
