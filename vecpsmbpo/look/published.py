@@ -52,8 +52,8 @@ _MBPO = {
     ),
     "ant": _mbpo("50:781±185 75:1112±604 100:1624±894 125:2203±1348 150:2883±1304 200:4323±1247 300:5397±559"),
 }
-# What figures 4 and 5 call asymptotic: SAC at the last step that is known of it. After three million, from erl_lib; on the
-# control suite's two tasks as `docs/benchmark.md` has it, on the sparse swing-up a range over what others report.
+# What figures 4 and 5 call asymptotic: SAC at the last step that is known of it. After three million, from erl_lib; on
+# the control suite's two tasks as `docs/benchmark.md` has it, on the sparse swing-up a range over what others report.
 _SAC = {
     "hopper": Level("SAC at 3M", 3809.0, 3809.0),
     "walker2d": Level("SAC at 3M", 6934.0, 6934.0),
