@@ -127,6 +127,25 @@ def test_a_task_has_something_to_see_and_to_do(kind, sizes):
         envs.make("custom", "host", make=f"{__name__}:{kind}")
 
 
+RULES = {
+    "one answer for all": (lambda obs, action, next_obs: jnp.all(next_obs > 5), r"gives bool\[\] for 7 transitions"),
+    "the first transition": (lambda obs, action, next_obs: next_obs[0] > 5, r"gives bool\[2\] for 7 transitions"),
+    "a number": (lambda obs, action, next_obs: next_obs[:, 0], r"gives float32\[7\] for 7 transitions, not bool\[7\]"),
+    "nothing": (lambda obs, action, next_obs: None, "gives nothing for 7 transitions"),
+    "of the object": (lambda self, obs, action, next_obs: obs[..., 0] > 0, "missing 1 required positional argument"),
+}
+
+
+@pytest.mark.parametrize(("rule", "line"), RULES.values(), ids=RULES)
+def test_a_termination_rule_answers_for_each_of_a_batch(rule, line, monkeypatch):
+    monkeypatch.setattr(Idle, "action_space", Idle.observation_space)
+    monkeypatch.setattr(Idle, "termination_rule", rule, raising=False)
+    with pytest.raises(SettingError, match=line):
+        envs.make("custom", "host", make=f"{__name__}:Idle")
+    monkeypatch.setattr(Idle, "termination_rule", lambda obs, action, next_obs: next_obs[..., 0] > 5)
+    assert envs.make("custom", "host", make=f"{__name__}:Idle").spec.obs_size == 2
+
+
 class Stays(Env):
     """An environment of two numbers in which nothing happens."""
 

@@ -15,7 +15,7 @@ def own_task(*, num_envs: int, seed: int, make: str) -> HostEnv:
     learned. Its time limit is the one that it is registered or wrapped with (`gymnasium.wrappers.TimeLimit`).
 
     Raises:
-        SettingError: it is something else, or cannot be learned.
+        SettingError: it is something else, or cannot be learned, or its rule gives something else.
     """
     label = f"env.make={make}"
     env = custom.load(make)
@@ -24,7 +24,9 @@ def own_task(*, num_envs: int, seed: int, make: str) -> HostEnv:
     rule = getattr(type(env.unwrapped), "termination_rule", None)  # of the class: on the object it would be a method
     every = [env, *(custom.load(make) for _ in range(num_envs - 1))]
     simulators = [GymnasiumSimulator(each, seed + index, label) for index, each in enumerate(every)]
-    return batch(simulators, make.rpartition(":")[2], _limit(env), rule)
+    made = batch(simulators, make.rpartition(":")[2], _limit(env), rule)
+    custom.check_rule(made.spec, label)
+    return made
 
 
 def _limit(env: gymnasium.Env) -> int:

@@ -31,6 +31,7 @@ def own_task(*, make: str) -> Env:
     if not isinstance(env.spec, EnvSpec):
         raise SettingError(f"env.make={make}: its spec is of {type(env.spec).__name__}, not an EnvSpec")
     _check_shapes(env, f"env.make={make}")
+    custom.check_rule(env.spec, f"env.make={make}")
     return env
 
 
