@@ -97,7 +97,7 @@ def _initialize(distributed: str, where: dict[str, Any]) -> None:
     waiting.start()
     waiting.join(SILENCE_S)
     if waiting.is_alive():
-        address = where.get("coordinator_address")
+        address = str(where.get("coordinator_address"))
         at = f", of which process 0 is to answer at {address}," if where.get("process_id") else ""
         words.complain(f"waiting for the other processes of the run{at} for up to {PATIENCE_S} s …")
         waiting.join(PATIENCE_S - SILENCE_S)

@@ -48,7 +48,8 @@ def _check_shapes(env: Env, label: str) -> None:
     action = jax.ShapeDtypeStruct((env.spec.action_size,), jnp.float32)
     after = jax.eval_shape(env.step, first, action)
     _check_state(after, env.spec, f"{label}: its step")
-    if jax.tree.structure(after) != jax.tree.structure(first):
+    structures: list[Any] = [jax.tree.structure(state) for state in (first, after)]
+    if structures[0] != structures[1]:
         raise SettingError(f"{label}: its step gives a State of other parts than its reset")
     parts = zip(jax.tree_util.tree_leaves_with_path(first), jax.tree.leaves(after), strict=True)
     for (path, one), other in parts:
