@@ -108,8 +108,8 @@ def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp
     result = command("train", f"run_dir={folder}", cwd=tmp_path)
     assert result.returncode == 2
     *warnings, last = result.stderr.splitlines()
-    damaged = "vecpsmbpo: warning: the checkpoint at step {} is damaged; taking the one before it"
-    assert warnings == [damaged.format(120), damaged.format(80)]
+    for step, line in zip((120, 80), warnings, strict=True):
+        assert line.startswith(f"vecpsmbpo: warning: the checkpoint at step {step} is damaged")
     assert last.startswith(f"vecpsmbpo: {folder}/checkpoints: holds checkpoints, but none that can be read (")
     assert _files(folder) == before
 
