@@ -33,13 +33,12 @@ def files(folder: Path, options: dict) -> Iterator[Trial]:
         _go([f"total_steps={STOPPED}", f"run_dir={whole}"])
         shutil.copytree(whole, reference)
         _go([f"total_steps={END}", f"run_dir={reference}"])
-        kinds = _kinds(whole)
-        if backend == "mjx":  # all else is written by what runs around both drivers
-            kinds = [name for name in kinds if name.parts[0] == CHECKPOINTS]
-        for which in kinds:
+        for kind, which in _kinds(whole).items():
+            if backend == "mjx" and which.parts[0] != CHECKPOINTS:
+                continue  # written by what runs around both drivers
             for damage, act in DAMAGES.items():
                 attempt = partial(_gone_on_with, whole, reference, which, act)
-                yield f"{backend}: {which} {damage}", attempt
+                yield f"{backend}: {kind} {damage}", attempt
         for what, (act, word) in MISTAKES.items():
             yield f"{backend}: {what}", partial(_refused, whole, reference, task, act, word)
 
@@ -82,16 +81,16 @@ def _copied(whole: Path) -> Path:
     return shutil.copytree(whole, copy)
 
 
-def _kinds(run_dir: Path) -> list[Path]:
-    """One file of each kind in a run directory."""
+def _kinds(run_dir: Path) -> dict[str, Path]:
+    """One file of each kind in a run directory, the largest; by a name that is the same in every run."""
     found: dict[str, Path] = {}
     newest = f"{CHECKPOINTS}/{STOPPED}"
-    for path in sorted(run_dir.rglob("*"), key=lambda path: -path.stat().st_size):
+    for path in sorted(run_dir.rglob("*"), key=lambda path: (-path.stat().st_size, path)):
         name = path.relative_to(run_dir)
         if path.is_file() and path.stat().st_size and (name.parts[0] != CHECKPOINTS or newest in str(name)):
             kind = "array" if path.name[0].isdigit() else path.name.partition(".tfevents.")[0]
-            found.setdefault(f"{name.parts[0]}/{kind}", name)
-    return list(found.values())
+            found.setdefault(kind if len(name.parts) == 1 else f"{name.parts[0]}/{kind}", name)
+    return found
 
 
 def _flip(path: Path) -> None:
