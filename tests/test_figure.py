@@ -162,7 +162,7 @@ def test_umap_is_shown_while_it_is_at_work(tmp_path, monkeypatch):
             events.append(item[0])
             yield item
 
-    monkeypatch.setattr(figure.waiting, "steps", steps)
+    monkeypatch.setattr(figure.working, "steps", steps)
     obs = np.arange(300.0)[:, None] * np.ones(4)
     visited = lambda run: (events.append("visited"), states.Visited(run, np.arange(300), obs))[1]  # noqa: E731
     monkeypatch.setattr(states, "visited", visited)

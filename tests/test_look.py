@@ -9,7 +9,7 @@ import pytest
 from tests import looks
 from tests.helpers import environment
 from vecpsmbpo import algorithms, cli
-from vecpsmbpo.look import plot, published, runs, style, waiting
+from vecpsmbpo.look import plot, published, runs, style, working
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
@@ -135,8 +135,8 @@ def test_somebody_at_a_terminal_sees_how_far_it_has_come(mixed, tmp_path, monkey
         assert cli.main([command, *map(str, mixed), *rest]) == 0
         assert "reading" not in capsys.readouterr().err
     monkeypatch.setenv("FORCE_COLOR", "1")  # rich's sign for a terminal
-    for soon, shown in ((waiting.SOON, False), (0, True)):
-        monkeypatch.setattr(waiting, "SOON", soon)
+    for soon, shown in ((working.SOON, False), (0, True)):
+        monkeypatch.setattr(working, "SOON", soon)
         for command, *rest in commands:
             assert cli.main([command, *map(str, mixed), *rest]) == 0
             assert ("reading" in capsys.readouterr().err) == shown

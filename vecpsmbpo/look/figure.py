@@ -14,7 +14,7 @@ import numpy as np
 
 from vecpsmbpo import arguments, config, logged
 from vecpsmbpo.jsonl import EPISODES_FILE
-from vecpsmbpo.look import compare, experiments, files, groups, published, runs, states, waiting
+from vecpsmbpo.look import compare, experiments, files, groups, published, runs, states, working
 from vecpsmbpo.look.curves import Curve, axis_label, curve, error_band, joined
 from vecpsmbpo.look.experiments import Experiment
 from vecpsmbpo.look.groups import Group
@@ -319,7 +319,7 @@ def draw_states(experiment: Experiment) -> "Figure":
     tasks = [(task, [one.lanes[0].run for one in here]) for task, here in experiment.tasks(["algo"])]
     columns = STAGES * max(len(found) for _, found in tasks)
     figure, axes = style.grid(columns * len(tasks), columns, (2.1, 2.2))
-    for row, (task, found) in enumerate(waiting.steps(tasks, "UMAP")):
+    for row, (task, found) in enumerate(working.steps(tasks, "UMAP")):
         names = [groups.display("algo", one.settings.algo) for one in found]
         looks = style.looks_of(names)
         seen = [states.visited(one) for one in found]

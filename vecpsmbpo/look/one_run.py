@@ -16,7 +16,7 @@ from vecpsmbpo.algorithms.catalogue import of_algorithm
 from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE, SESSIONS_FILE
 from vecpsmbpo.look import compare, diagnose, films, groups, statistics
 from vecpsmbpo.look.curves import curve, numbers
-from vecpsmbpo.look.runs import Lane, Run
+from vecpsmbpo.look.runs import Lane, Run, known
 from vecpsmbpo.settings import Settings
 
 if TYPE_CHECKING:
@@ -64,11 +64,11 @@ def gaps(run: Run) -> Iterator[str]:
     """What its page cannot show of a run because its files do not have it: a line each."""
     from vecpsmbpo.look import posterior
 
-    if not known(run, "eval_return"):
+    if not values(run, "eval_return"):
         yield f"{METRICS_FILE} has no evaluation return that is a number; none is shown"
     else:
-        silent = [lane.name for lane in run.lanes if not np.isfinite(numbers(lane.epochs, "eval_return")).any()]
-        if silent:
+        evaluated = _evaluated(run)
+        if silent := [lane.name for lane in run.lanes if lane not in evaluated]:
             yield f"{METRICS_FILE} has no evaluation return of {', '.join(silent)}"
     if lacking := posterior.lacking(run.episodes):
         yield f"{EPISODES_FILE} has no usable {', '.join(lacking)}; who acted is not shown"
@@ -139,16 +139,16 @@ def _plural(count: int, what: str) -> str:
 
 def _tiles(run: Run) -> list[tuple[str, str]]:
     """The numbers to see first."""
-    tiles = _return_tiles(run) if known(run, "eval_return") else [("–", "evaluation return")]
-    if seconds := known(run, "seconds"):
+    tiles = _return_tiles(run) if values(run, "eval_return") else [("–", "evaluation return")]
+    if seconds := values(run, "seconds"):
         tiles.append((_duration(seconds[-1]), "wall time"))
-    if speeds := known(run, "updates_per_s"):
+    if speeds := values(run, "updates_per_s"):
         tiles.append((f"{speeds[-1]:,.0f}", "SAC updates per second"))
     return tiles
 
 
 def _return_tiles(run: Run) -> list[tuple[str, str]]:
-    lanes = [lane for lane in run.lanes if np.isfinite(numbers(lane.epochs, "eval_return")).any()]
+    lanes = _evaluated(run)
     last = [compare.score(lane, run.env_steps, _scoring()) for lane in lanes]
     final = statistics.bootstrap(statistics.interquartile_mean, [np.array([seed.final for seed in last])])
     best = statistics.Estimate(max(seed.best for seed in last), np.nan, np.nan)
@@ -160,10 +160,15 @@ def _return_tiles(run: Run) -> list[tuple[str, str]]:
     ]
 
 
-def known(run: Run, name: str) -> list[float]:
+def values(run: Run, name: str) -> list[float]:
     """What the log has of a column, by time; a frozen lane's last line has nothing."""
     column = numbers(run.metrics.columns, name)
-    return column[np.isfinite(column)].tolist()
+    return column[known(column)].tolist()
+
+
+def _evaluated(run: Run) -> list[Lane]:
+    """The lanes that have an evaluation return to show."""
+    return [lane for lane in run.lanes if known(numbers(lane.epochs, "eval_return")).any()]
 
 
 def _scoring() -> dict[str, Any]:
@@ -276,7 +281,7 @@ def _add_settings(page: "Page", run: Run) -> None:
 
 def _at(lane: Lane, step: float) -> str:
     found = numbers(lane.epochs, "eval_return")[lane.epochs["env_steps"] == step]
-    return f"{found[0]:,.1f}" if len(found) and np.isfinite(found[0]) else "–"
+    return f"{found[0]:,.1f}" if len(found) and known(found[0]) else "–"
 
 
 def command(settings: Settings) -> str:

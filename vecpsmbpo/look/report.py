@@ -124,7 +124,7 @@ def _add_comparison(page: "Page", what: str, found: Sequence[Run], together: Seq
         here = [one for one in here if one.lanes]
         pictures = [_curves_picture(page, here, y) for y in ("eval_return", "train_return")]
         page.add(f"<h2>{escape(task)}</h2>", html.panels(filter(None, pictures)))
-    if silent := [str(run.path) for run in found if not one_run.known(run, "eval_return")]:
+    if silent := [str(run.path) for run in found if not one_run.values(run, "eval_return")]:
         page.add(f'<p class="soft">No table: without evaluation returns: {escape(", ".join(silent))}.</p>')
         return
     options = {name: option.default for name, option in compare.OPTIONS.items()}

@@ -15,7 +15,7 @@ import numpy as np
 
 from vecpsmbpo import config, jsonl
 from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE
-from vecpsmbpo.look import waiting
+from vecpsmbpo.look import working
 from vecpsmbpo.settings import SettingError, Settings
 
 Array = np.ndarray
@@ -105,7 +105,7 @@ class Run:
     def episodes(self) -> Columns:
         """Columns of episodes.jsonl of all lanes, [E] each; `probs` [E, N·M]."""
         path = self.path / EPISODES_FILE
-        with waiting.reading([path] if self.watched else []) as advance:
+        with working.reading([path] if self.watched else []) as advance:
             return read(path, needed=("env_steps", *self.settings.lanes[0]), advance=advance).columns
 
     def of_lane(self, values: Mapping[str, float]) -> Columns:
@@ -152,7 +152,7 @@ def load_each(paths: Sequence[Path]) -> list[Run]:
     Raises:
         SettingError: as `load`.
     """
-    with waiting.reading(path / METRICS_FILE for path in paths) as advance:
+    with working.reading(path / METRICS_FILE for path in paths) as advance:
         return [load(path, advance) for path in paths]
 
 

@@ -1,12 +1,24 @@
 """What a person at a terminal sees while a command works: a line on stderr that leaves nothing behind."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 T = TypeVar("T")
+
+SOON = 2**22  # bytes that are read before anybody wonders
 
 
 class Working:
@@ -49,3 +61,21 @@ class Working:
     def _begin(self, what: str, total: int | None) -> None:
         self._progress.remove_task(self._task)
         self._task = self._progress.add_task(what, total=total, done="")
+
+
+def steps(items: Iterable[T], what: str) -> Iterator[T]:
+    """The items one by one, for work that has nothing else to say."""
+    with Working() as working:
+        yield from working.through(items, what)
+
+
+@contextmanager
+def reading(paths: Iterable[Path]) -> Iterator[Callable[[int], None]]:
+    """A bar over the bytes of files, unless they are few; within it, a function to call with how many were read."""
+    console = Console(stderr=True)
+    total = sum(path.stat().st_size for path in paths if path.is_file())
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    shown = console.is_terminal and total > SOON
+    with Progress(*columns, console=console, transient=True, disable=not shown) as progress:
+        task = progress.add_task("reading", total=total)
+        yield lambda count: progress.advance(task, count)

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from vecpsmbpo import arguments
-from vecpsmbpo.look import files, waiting
+from vecpsmbpo.look import files, working
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.theory import example, tabular
 from vecpsmbpo.theory.tabular import Belief, Estimate
@@ -139,7 +139,7 @@ def compute(options: Options) -> Experiment:
     tasks: list[tuple[Belief, float]] = [(belief, ratio) for belief in beliefs for ratio in REAL_RATIOS[:-1]]
     tasks.append((tabular.EXACT, 1.0))
     data, arms = None, []
-    for belief, ratio in waiting.steps(tasks, "PSRL"):
+    for belief, ratio in working.steps(tasks, "PSRL"):
         outcome = tabular.psrl(world, belief, ratio, truth)
         arms.append(Arm.of(belief.name, ratio, outcome))
         data = outcome.counts if data is None else data  # the first task is exact PSRL
