@@ -1,5 +1,6 @@
 """Which tasks there are, on which backends. Imports no simulator until `make` needs one."""
 
+import contextlib
 import importlib
 import importlib.util
 from dataclasses import dataclass, field
@@ -123,7 +124,8 @@ def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0, 
     which = " ".join([f"env={name}", *(f"env.{option}={value}" for option, value in options.items())])
     try:
         found = getattr(importlib.import_module(f"vecpsmbpo.envs.{backend}.{module}"), attribute)
-        made = found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **options)
+        with contextlib.chdir("."):  # to come back: a task that goes elsewhere must not take the run's files along
+            made = found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **options)
         if min(made.spec.obs_size, made.spec.action_size) < 1:
             sizes = f"{made.spec.obs_size} observation(s) and {made.spec.action_size} action(s)"
             raise SettingError(f"{which}: has {sizes}; it must have at least one of each")

@@ -127,6 +127,19 @@ def test_a_task_has_something_to_see_and_to_do(kind, sizes):
         envs.make("custom", "host", make=f"{__name__}:{kind}")
 
 
+class Elsewhere(Nothing):
+    observation_space = Nothing.action_space
+
+    def __init__(self):
+        os.chdir("/")
+
+
+def test_a_task_that_leaves_the_working_directory_does_not_take_the_run_along(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    envs.make("custom", "host", make=f"{__name__}:Elsewhere")
+    assert os.getcwd() == str(tmp_path)
+
+
 RULES = {
     "one answer for all": (lambda obs, action, next_obs: jnp.all(next_obs > 5), r"gives bool\[\] for 7 transitions"),
     "the first transition": (lambda obs, action, next_obs: next_obs[0] > 5, r"gives bool\[2\] for 7 transitions"),

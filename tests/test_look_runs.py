@@ -37,6 +37,18 @@ def test_a_line_cut_short_and_noise(tmp_path):
     assert [f"{log}: 3 damaged line(s) left out"] == list(runs.warnings([run]))
 
 
+def test_a_word_among_numbers_is_a_gap(tmp_path):
+    path = looks.write(tmp_path / "a", looks.epochs([1, 2, 3, 4], real_ratio_probs=[0.25, 0.75]))
+    first, second, *others = map(json.loads, (path / "metrics.jsonl").read_text().splitlines())
+    second |= {"eval_return": "oops", "critic_loss": [1, 2], "real_ratio_probs": "oops", "only_a_word": "oops"}
+    (path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in (first, second, *others)))
+    epochs = runs.load(path).lanes[0].epochs
+    np.testing.assert_array_equal(epochs["eval_return"], [1, np.nan, 3, 4])
+    np.testing.assert_array_equal(epochs["critic_loss"], [np.nan, np.nan, 1 / 3, 1 / 4])
+    assert np.isnan(epochs["real_ratio_probs"]).tolist() == [[False] * 2, [True] * 2, [False] * 2, [False] * 2]
+    assert "only_a_word" not in epochs
+
+
 def test_a_frozen_lane_keeps_the_others(tmp_path):
     frozen = looks.epochs([5, 6], seed=1)
     frozen.append(dict.fromkeys(frozen[0]) | {"env_steps": 120, "seed": 1, "frozen": True})

@@ -5,6 +5,7 @@ episodes are some arrays and not a million dictionaries. Commands that somebody 
 (`load_all`, `load_each`).
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -230,7 +231,7 @@ def _columns(lines: list[dict[str, Any]]) -> Columns:
 
 
 def _column(values: list[Any]) -> Array | None:
-    """[L] floats, or [L, ...] where the values are lists, flattened. None where they are no numbers of one shape."""
+    """[L] floats, or [L, ...] where the values are lists, flattened. None where there is no number among them."""
     column: Array | None
     try:
         column = np.array(values, float)  # None becomes NaN, "inf" infinity
@@ -241,13 +242,20 @@ def _column(values: list[Any]) -> Array | None:
 
 
 def _with_gaps(values: list[Any]) -> Array | None:
-    """As `_column`, where some values are lists and others null."""
-    like = next((value for value in values if isinstance(value, list)), None)
-    if like is None:
+    """As `_column`, NaN where a value is null, a word, or a list where others are numbers."""
+    found = [_numbers(value) for value in values]
+    shapes = Counter(numbers.shape for numbers in found if numbers is not None)
+    if not shapes:
         return None
+    ((shape, _),) = shapes.most_common(1)
+    gap = np.full(shape, np.nan)
+    return np.stack([gap if numbers is None or numbers.shape != shape else numbers for numbers in found])
+
+
+def _numbers(value: Any) -> Array | None:
+    """A number or a list of them; None where it is neither."""
     try:
-        nothing = np.full(np.shape(like), np.nan)
-        return np.array([nothing if value is None else value for value in values], float)
+        return None if value is None else np.array(value, float)
     except (TypeError, ValueError, OverflowError):
         return None
 
