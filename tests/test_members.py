@@ -328,6 +328,9 @@ DAMAGED: dict[str, Callable[[Path], object]] = {
     "short": lambda path: (path / "policy.npz").write_bytes((path / "policy.npz").read_bytes()[:-9]),
     "empty": lambda path: (path / "policy.npz").write_bytes(b""),
     "words": lambda path: np.savez(path / "policy.npz", kernel_0=np.full((5, 1), "x"), bias_0=np.zeros(1)),
+    "rule": lambda path: (path / "policy.json").write_text(
+        (path / "policy.json").read_text().replace('"relu"', '"gelu"')
+    ),
     "other": lambda path: np.savez(path / "policy.npz", kernel_0=np.zeros((7, 1)), bias_0=np.zeros(1)),
     "broken": lambda path: np.savez(
         path / "policy.npz", kernel_0=np.zeros((5, 3)), bias_0=np.zeros(3), kernel_1=np.zeros((4, 1)), bias_1=np.ones(1)
@@ -346,10 +349,6 @@ MISTAKES = [
     (["export", "run", "member=2,0"], "member=2,0: must be best or one of 0,0  0,1  1,0  1,1"),
     (["export", "run", "out=file"], "out=file: must be a directory"),
     (["export", "pets"], "run_dir=pets: algo=pets plans its actions; there is no policy to export"),
-    (
-        ["export", "slbo"],
-        "run_dir=slbo: what is exported is a network as SAC's, ReLU and a tanh at its end; the one of",
-    ),
     (["export", "together"], "member=best: with posterior=average all members act together, which is no single policy"),
     (["export", "broken_run"], "broken_run/checkpoints: holds checkpoints, but none that can be read ("),
     (["export", "bare"], "run_dir=bare: holds no checkpoint yet"),
@@ -397,7 +396,6 @@ def shelf(trained, policy, damaged_run, tmp_path, monkeypatch):
         (tmp_path / name).symlink_to(trained)
     (tmp_path / "file").write_text("")
     looks.write(tmp_path / "pets", looks.epochs([1]), algo="pets")
-    looks.write(tmp_path / "slbo", looks.epochs([1]), algo="slbo")
     looks.write(tmp_path / "together", looks.epochs([1]), posterior="average")
     (tmp_path / "broken_run").symlink_to(damaged_run)
     looks.write(tmp_path / "bare", looks.epochs([1]), backend="host")

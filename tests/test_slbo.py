@@ -1,5 +1,7 @@
 """TRPO against dense algebra and values worked by hand, SLBO's loss, and whole runs."""
 
+import runpy
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,15 +9,17 @@ import pytest
 import scipy.stats
 from jax.flatten_util import ravel_pytree
 
+from tests.helpers import algorithm as make_algorithm
 from tests.helpers import tiny
 from tests.test_drivers import make_driver
 from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, replay
 from vecpsmbpo.algorithms.slbo import multistep, networks, trpo
 from vecpsmbpo.envs import specs
+from vecpsmbpo.look import export
 from vecpsmbpo.programs import evaluation_keys, initial_inputs
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.types import EnvSpec, Hyper, Transition
+from vecpsmbpo.types import EnvSpec, Hyper, Scaling, Transition
 
 SPEC = specs.get("ball_in_cup")
 NETS = trpo.make_networks(tiny(algo="slbo", policy_hidden_size=6), SPEC)
@@ -46,6 +50,23 @@ def test_divergence_of_normals_by_monte_carlo():
     estimate = np.mean(np.asarray(ours.log_prob(samples)) - np.asarray(other.log_prob(samples)))
     assert float(ours.divergence_to(other)) == pytest.approx(estimate, abs=0.01)
     assert float(ours.divergence_to(ours)) == 0
+
+
+def test_the_policy_as_matrices_acts_on_raw_observations(key, tmp_path):
+    """`act.py` in NumPy alone, and what is exported for JAX, where all of them clip and where none does."""
+    slbo = make_algorithm(tiny(algo="slbo", policy_hidden_size=6), SPEC)
+    params = jax.tree.map(lambda x: x + 0.3 * jax.random.normal(key, x.shape), slbo.init_agent(key).policy)
+    size = SPEC.obs_size + SPEC.action_size
+    scaling = Scaling(jnp.linspace(-2.0, 5.0, size), jnp.linspace(0.1, 3.0, size), jnp.ones(SPEC.obs_size + 1))
+    network = slbo.feedforward((params, scaling))
+    (tmp_path / "act.py").write_text(export.code(network))
+    np.savez(tmp_path / "policy.npz", **network.arrays)
+    alone = runpy.run_path(str(tmp_path / "act.py"))["act"]
+    obs = np.random.default_rng(0).normal(size=(200, SPEC.obs_size), scale=3.0).astype(np.float32)
+    expected, _ = slbo.evaluation_action((params, scaling), jnp.int32(0), (), jnp.asarray(obs), key)
+    assert 0.05 < np.mean(np.abs(expected) == 1) < 0.95
+    np.testing.assert_allclose(alone(obs), expected, atol=1e-4)
+    np.testing.assert_allclose(network(obs, jnp), expected, atol=1e-4)
 
 
 # ── TRPO ─────────────────────────────────────────────────────────────────────────────────────────────────────────

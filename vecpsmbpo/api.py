@@ -180,7 +180,7 @@ class Policy:
 
     def policy(self, obs: Any) -> Array:
         """obs [..., O] -> mean action [..., A] in [-1, 1]."""
-        return self._exported.act(obs)
+        return self._exported.network(obs)
 
     def evaluate(self, seed: int = 0, **how: Any) -> Table:
         """Whole episodes: a row per episode.

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vecpsmbpo import dynamics, health, posterior, replay
+from vecpsmbpo.feedforward import Feedforward
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.networks import GaussianMLP
 from vecpsmbpo.settings import Settings
@@ -75,6 +76,11 @@ class Algorithm(ABC):
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         """How many gradient steps and imagined rows there are in the steps `learning`, which learn and of which
         `refreshes` begin with a refresh; of all members together. For the display of speeds."""
+
+    def feedforward(self, policy: Any) -> Feedforward | None:
+        """The mean action that `evaluation_action` gives of `policy`, of one member, as matrices on the host; None
+        where it is not one network's."""
+        return None
 
     def working_bytes(self, row: int) -> int:
         """Of the largest temporaries of one member; a transition takes `row` of them."""

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vecpsmbpo import arguments, jsonl, recorded
+from vecpsmbpo.feedforward import RULES, Feedforward
 from vecpsmbpo.look import dataset, files, runs
 from vecpsmbpo.look.exported import ABOUT_FILE, WEIGHTS_FILE
 from vecpsmbpo.settings import SettingError, Settings
@@ -44,15 +45,15 @@ from pathlib import Path
 import numpy as np
 
 WEIGHTS = np.load(Path(__file__).with_name("policy.npz"))
-LAYERS = [(WEIGHTS[f"kernel_{i}"], WEIGHTS[f"bias_{i}"]) for i in range(len(WEIGHTS) // 2)]
+LAYERS = [(WEIGHTS[f"kernel_{{i}}"], WEIGHTS[f"bias_{{i}}"]) for i in range(len(WEIGHTS) // 2)]
 
 
 def act(obs):
-    hidden = np.asarray(obs, np.float32)
+    x = np.asarray(obs, np.float32)
     for kernel, bias in LAYERS[:-1]:
-        hidden = np.maximum(hidden @ kernel + bias, 0)
+        x = {hidden}
     kernel, bias = LAYERS[-1]
-    return np.tanh(hidden @ kernel + bias)
+    return {end}
 
 
 if __name__ == "__main__":
@@ -82,10 +83,10 @@ def run(words: Sequence[str]) -> int:
     trained = members.load(found, options["lane"])
     episodes = dataset.collect(trained, out / "minari") if "minari" in options["also"] else []
     # All of them in memory first: what fails, fails before anything is written.
-    layers, contents = policy(trained, options["member"])
+    network, contents = policy(trained, options["member"])
     makers = {"policy.jax": jax_function, "policy.onnx": onnx_model}
     asked = {name: make for name, make in makers.items() if name.partition(".")[2] in options["also"]}
-    contents |= {name: make(layers) for name, make in asked.items()}
+    contents |= {name: make(network) for name, make in asked.items()}
     files.write_together(out, contents, without=makers.keys() - asked.keys())
     written = [out / name for name in contents]
     if "minari" in options["also"]:
@@ -96,16 +97,11 @@ def run(words: Sequence[str]) -> int:
 
 def _check_exportable(run: runs.Run, member: str) -> None:
     """Raises:
-    SettingError: the run has no single policy of the form that the files have.
+    SettingError: the run has no single policy.
     """
     settings = run.settings
     if settings.plans_actions:
         raise SettingError(f"run_dir={run.path}: algo={settings.algo} plans its actions; there is no policy to export")
-    if not settings.learns_by_sac:
-        raise SettingError(
-            f"run_dir={run.path}: what is exported is a network as SAC's, ReLU and a tanh at its end; the one of "
-            f"algo={settings.algo} is of another kind"
-        )
     if settings.averages_members and member == "best":
         raise SettingError(
             "member=best: with posterior=average all members act together, which is no single policy; name one, n,m"
@@ -123,18 +119,16 @@ def _check_extra(name: str) -> None:
             raise SettingError(f"also={name}: needs the package {package}; pip install 'vecpsmbpo[export]'")
 
 
-def policy(trained: "Trained", member: str) -> tuple[dict[str, np.ndarray], dict[str, bytes]]:
-    """A policy's `weights`, and its files by name.
+def policy(trained: "Trained", member: str) -> tuple[Feedforward, dict[str, bytes]]:
+    """A policy, and its files by name.
 
     Raises:
         SettingError: there is no such member, or an option of the task cannot be written as JSON.
     """
-    import jax
-
     from vecpsmbpo.look import members
 
     run, index = trained.run, _index(trained, member)
-    layers = weights(jax.tree.map(lambda x: np.asarray(x[index]), trained.actors()), trained.algorithm.spec.action_size)
+    network = trained.feedforward(index)
     about = {
         "task": run.settings.task,
         "run": run.name,
@@ -142,15 +136,26 @@ def policy(trained: "Trained", member: str) -> tuple[dict[str, np.ndarray], dict
         "env_steps": trained.step,
         **run.settings.lanes[trained.index],
         "member": members.member_names(run)[index],
-        "obs_size": trained.algorithm.spec.obs_size,
-        "action_size": trained.algorithm.spec.action_size,
+        "obs_size": network.obs_size,
+        "action_size": network.action_size,
+        "network": {"hidden": network.hidden, "end": network.end},
         "settings": settings_of(run.settings, trained.index),
     }
     try:
         text = json.dumps(about, indent=2, allow_nan=False) + "\n"
     except ValueError:  # a task's own option may be infinite
         raise SettingError(f"run_dir={run.path}: has an option that JSON cannot have, infinity or NaN") from None
-    return layers, {WEIGHTS_FILE: _archive(layers), "act.py": ACT.encode(), ABOUT_FILE: text.encode()}
+    return network, {
+        WEIGHTS_FILE: _archive(network.arrays),
+        "act.py": code(network).encode(),
+        ABOUT_FILE: text.encode(),
+    }
+
+
+def code(network: Feedforward) -> str:
+    """act.py: the policy in NumPy, with policy.npz beside it."""
+    rules = {"hidden": RULES[network.hidden].code, "end": RULES[network.end].code}
+    return ACT.format(**{name: code.format("x @ kernel + bias") for name, code in rules.items()})
 
 
 def settings_of(settings: Settings, lane: int) -> dict[str, Any]:
@@ -176,66 +181,48 @@ def _index(trained: "Trained", member: str) -> int:
     return names.index(member)
 
 
-def weights(actor: Any, action_size: int) -> dict[str, np.ndarray]:
-    """Kernels [in, out] and biases [out] of an actor's layers, in order; of the last one what gives the mean action."""
-    layers = actor["params"]["ReluMLP_0"]
-    ordered = sorted(layers, key=lambda name: int(name.removeprefix("Dense_")))
-    found = {}
-    for index, name in enumerate(ordered):
-        last = index == len(ordered) - 1
-        kernel, bias = layers[name]["kernel"], layers[name]["bias"]
-        found[f"kernel_{index}"] = kernel[:, :action_size] if last else kernel
-        found[f"bias_{index}"] = bias[:action_size] if last else bias
-    return found
-
-
-def jax_function(layers: dict[str, np.ndarray]) -> bytes:
-    """obs [b, O] -> action [b, A] of `weights`, for any b, as `jax.export.deserialize(...).call` takes it."""
+def jax_function(network: Feedforward) -> bytes:
+    """obs [b, O] -> action [b, A], for any b, as `jax.export.deserialize(...).call` takes it."""
     import jax
     import jax.numpy as jnp
     from jax import export
 
-    count = len(layers) // 2
-
-    def act(obs: Any) -> Any:
-        hidden = obs
-        for index in range(count):
-            hidden = hidden @ layers[f"kernel_{index}"] + layers[f"bias_{index}"]
-            hidden = jnp.maximum(hidden, 0) if index < count - 1 else jnp.tanh(hidden)
-        return hidden
-
-    shape = (*export.symbolic_shape("b"), layers["kernel_0"].shape[0])
-    exported = export.export(jax.jit(act), platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, jnp.float32))
+    shape = (*export.symbolic_shape("b"), network.obs_size)
+    function = jax.jit(lambda obs: network(obs, jnp))
+    exported = export.export(function, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, jnp.float32))
     return bytes(exported.serialize())
 
 
-def onnx_model(layers: dict[str, np.ndarray]) -> bytes:
+def onnx_model(network: Feedforward) -> bytes:
     """The same as an ONNX model with input `obs` [b, O] and output `action` [b, A]; no converter is needed for so few
     operations."""
     from onnx import TensorProto, checker, helper, numpy_helper
 
-    nodes, value, last = [], "obs", len(layers) // 2 - 1
+    arrays = network.arrays | {"least": np.float32(-1.0), "most": np.float32(1.0)}
+    nodes, value, last = [], "obs", len(network.layers) - 1
     for index in range(last + 1):
         nodes.append(helper.make_node("Gemm", [value, f"kernel_{index}", f"bias_{index}"], [f"sum_{index}"]))
-        value = f"hidden_{index}" if index < last else "action"
-        nodes.append(helper.make_node("Relu" if index < last else "Tanh", [f"sum_{index}"], [value]))
+        value, rule = (f"hidden_{index}", network.hidden) if index < last else ("action", network.end)
+        inputs = [f"sum_{index}", *(("least", "most") if rule == "clip" else ())]
+        nodes.append(helper.make_node(RULES[rule].onnx, inputs, [value]))
 
     def info(name: str, size: int) -> Any:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["b", size])
 
-    inputs, outputs = info("obs", layers["kernel_0"].shape[0]), info("action", len(layers[f"bias_{last}"]))
-    initial = [numpy_helper.from_array(np.ascontiguousarray(values), name) for name, values in layers.items()]
-    graph = helper.make_graph(nodes, "policy", [inputs], [outputs], initial)
+    used = {name for node in nodes for name in node.input}
+    initial = [numpy_helper.from_array(np.ascontiguousarray(arrays[name]), name) for name in arrays if name in used]
+    shapes = [info("obs", network.obs_size)], [info("action", network.action_size)]
+    graph = helper.make_graph(nodes, "policy", *shapes, initial)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
     checker.check_model(model)
     return bytes(model.SerializeToString())
 
 
-def _archive(layers: dict[str, np.ndarray]) -> bytes:
+def _archive(arrays: dict[str, np.ndarray]) -> bytes:
     """What `np.savez` writes, without the moment of writing: the same policy is the same file."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for name, values in layers.items():
+        for name, values in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as entry:
                 np.lib.format.write_array(entry, np.asarray(values), allow_pickle=False)
     return content.getvalue()

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from vecpsmbpo import config, crash, words
+from vecpsmbpo import config, crash, feedforward, words
 from vecpsmbpo.envs import registry
+from vecpsmbpo.feedforward import RULES, Feedforward
 from vecpsmbpo.settings import SettingError, Settings
 
 Array = np.ndarray
-Layers = list[tuple[Array, Array]]
 
 WEIGHTS_FILE, ABOUT_FILE = "policy.npz", "policy.json"
 ALONE = ("policy", "actions", "devices")  # what is told of a run's evaluation, and has no meaning for one policy
@@ -34,21 +34,13 @@ class Exported:
         path: the directory.
         settings: of the run that it comes from.
         about: what policy.json has beside them: task, run, seed, member, env_steps, ...
-        layers: kernel [in, out] and bias [out] of each, in order.
+        network: obs [..., O] -> mean action [..., A] in [-1, 1].
     """
 
     path: Path
     settings: Settings
     about: Mapping[str, Any]
-    layers: Layers
-
-    def act(self, obs: Any) -> Array:
-        """obs [..., O] -> mean action [..., A] in [-1, 1]."""
-        hidden = np.asarray(obs, np.float32)
-        for kernel, bias in self.layers[:-1]:
-            hidden = np.maximum(hidden @ kernel + bias, 0)
-        kernel, bias = self.layers[-1]
-        return np.tanh(hidden @ kernel + bias)
+    network: Feedforward
 
 
 def is_one(path: str | Path) -> bool:
@@ -71,25 +63,29 @@ def load(path: str | Path) -> Exported:
         about = json.loads((path / ABOUT_FILE).read_text())
         record = about.pop("settings")
         with np.load(path / WEIGHTS_FILE) as stored:
-            layers = [(stored[f"kernel_{i}"], stored[f"bias_{i}"]) for i in range(len(stored.files) // 2)]
+            layers = feedforward.layers_of({name: stored[name] for name in stored.files})
+        network = Feedforward(layers, **about.pop("network", {}))  # which those written before 2026-11-29 lack
         settings = replace(config.from_record(record, f"{path}: its {ABOUT_FILE}"), run_dir="")
-        _check_shapes(layers, registry.TASKS[settings.env].sizes)
+        _check(network, registry.TASKS[settings.env].sizes)
     except DAMAGE as error:
         raise SettingError(f"{path}: holds no policy that can be read ({words.of(error)})") from None
-    return Exported(path, settings, about, layers)
+    return Exported(path, settings, about, network)
 
 
-def _check_shapes(layers: Layers, task: Sequence[int] | None) -> None:
-    """That layers are of one network, for observations and actions as the task has them, where that is known.
+def _check(network: Feedforward, task: Sequence[int] | None) -> None:
+    """That its layers fit together, and observations and actions as the task has them, where that is known.
 
     Raises:
-        ValueError: they are not.
+        ValueError: they do not, or a rule between them is not known.
     """
+    if not {network.hidden, network.end} <= RULES.keys():
+        raise ValueError(f"{ABOUT_FILE} names a rule that is not one of {', '.join(RULES)}")
+    layers = network.layers
     whole = all(kernel.ndim == 2 and kernel.shape[1:] == bias.shape for kernel, bias in layers)
     kinds = {array.dtype.kind for layer in layers for array in layer}
     if not layers or not whole or kinds != {"f"} or any(len(k) != len(b) for (_, b), (k, _) in pairwise(layers)):
         raise ValueError(f"{WEIGHTS_FILE} has not the layers of a policy")
-    has = (len(layers[0][0]), len(layers[-1][1]))
+    has = (network.obs_size, network.action_size)
     if task and has != tuple(task[:2]):
         raise ValueError(f"from {has[0]} observations to {has[1]} actions, where the task has {task[0]} and {task[1]}")
 
@@ -125,7 +121,7 @@ def evaluate(policy: Exported, settings: Settings, seed: int = 0) -> tuple[Array
     world = fresh.world(settings, settings.eval_episodes, settings.episode_length, seed)
     crash.doing("evaluating")
     certain = np.zeros(settings.eval_episodes)
-    seen = fresh.collect(world, lambda t, obs, key: (policy.act(obs), certain), world.length, jax.random.key(seed))
+    seen = fresh.collect(world, lambda t, obs, key: (policy.network(obs), certain), world.length, jax.random.key(seed))
     return seen.reward.sum(axis=1), seen.there.sum(axis=1)
 
 

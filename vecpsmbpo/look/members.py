@@ -14,6 +14,7 @@ from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.checkpoint import Saved
 from vecpsmbpo.drivers.common import evaluation_policies
 from vecpsmbpo.evaluate import restore, restore_each
+from vecpsmbpo.feedforward import Feedforward
 from vecpsmbpo.layout import BY_SEED
 from vecpsmbpo.look.runs import Run, check_lane
 from vecpsmbpo.settings import SettingError
@@ -59,6 +60,16 @@ class Trained:
     def actors(self) -> Any:
         """Parameters of every member's policy, leaves [N·M, ...]."""
         return self._some(self._members, self.state.agents.actor)
+
+    def feedforward(self, member: int) -> Feedforward:
+        """A member's mean action as matrices, where it does not plan."""
+        if self.has_members:
+            policy = jax.tree.map(lambda x: x[member], self.actors())
+        else:
+            policy = self.of_lane(evaluation_policies(self.algorithm)(self.state, self.state.key))
+        found = self.algorithm.feedforward(policy)
+        assert found is not None
+        return found
 
     def critics(self) -> tuple[Any, Array]:
         """Parameters of every member's critics, leaves [N·M, ...], and its entropy coefficient α, [N·M]."""

@@ -207,7 +207,7 @@ def _alone(policy: exported.Exported) -> Policies:
     from vecpsmbpo import runtime
 
     runtime.configure(policy.settings)
-    return [(policy.path.resolve().name, policy.act)]
+    return [(policy.path.resolve().name, policy.network)]
 
 
 def _policies(run: Run, options: dict[str, Any]) -> Policies:

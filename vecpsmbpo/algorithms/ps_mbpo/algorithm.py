@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vecpsmbpo import health, imagination, mixing, posterior, replay, sac
+from vecpsmbpo import feedforward, health, imagination, mixing, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
+from vecpsmbpo.feedforward import Feedforward
 from vecpsmbpo.sac import Agent
 from vecpsmbpo.types import Bandit, Counters, Hyper, Params, Posterior, SeedState, Transition, Whole
 
@@ -129,6 +130,10 @@ class PsMbpo(Algorithm):
             return self._of_mixture(policy, obs, key, sampled=sampled), ()
         modes = jax.vmap(lambda params: self.nets.actor.distribution(params, obs).mode())(policy)
         return self.layout.mean_over_members(modes), ()
+
+    def feedforward(self, policy: Params) -> Feedforward:
+        layers = feedforward.dense_layers(policy["params"]["ReluMLP_0"])
+        return Feedforward(feedforward.first_outputs(layers, self.spec.action_size))
 
     def values(self, state: SeedState) -> jax.Array | None:
         """[N·M] min(Q_1, Q_2) of each member's mean action, averaged over the starts of the last episodes.

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import dynamics, imagination
+from vecpsmbpo import dynamics, feedforward, imagination
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.slbo import multistep, trpo
 from vecpsmbpo.algorithms.slbo.settings import SlboSettings
+from vecpsmbpo.feedforward import Feedforward
 from vecpsmbpo.types import Counters, Model, Params, Scaling, SeedState
 
 
@@ -42,6 +43,13 @@ class Slbo(Algorithm):
         distribution = self.nets.policy.distribution(params, _whitened(scaling, obs))
         action = distribution.loc if self.settings.eval_actions == "mean" else distribution.sample(key)
         return jnp.clip(action, -1.0, 1.0), ()
+
+    def feedforward(self, policy: tuple[Params, Scaling]) -> Feedforward:
+        params, scaling = policy
+        layers = feedforward.dense_layers(params["params"]["TanhMLP_0"])
+        size = self.spec.obs_size
+        raw = feedforward.on_raw(layers, scaling.input_mean[:size], scaling.input_std[:size])
+        return Feedforward(raw, hidden="tanh", end="clip")
 
     def _scaling(self, state: SeedState) -> Scaling:
         """That the policy was trained with: of its model, at the last refresh."""
