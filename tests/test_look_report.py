@@ -139,6 +139,7 @@ MISSING = [
     ("epochs", "eval_return", "high", NO_RETURN),
     ("epochs", "eval_return", [1.0, 2.0], NO_RETURN),
     ("epochs", "eval_return", None, NO_RETURN),
+    ("epochs", "eval_return", 1e300, NO_RETURN),  # no return of float32
     ("epochs", "train_return", [1.0, 2.0], ""),
     ("epochs", "real_ratio_probs", [0.5, 0.5], ""),  # of another number of λ than there are
     *(
