@@ -60,10 +60,16 @@ def command(*arguments: str, cwd: Path, one_thread: bool = False, **kwargs: Any)
 
 def argv(*arguments: str, one_thread: bool = False) -> list[str]:
     """`one_thread` runs on a single core: one device, whose results are reproducible to the bit."""
-    one_core = (
-        ["taskset", "-c", "0"] if shutil.which("taskset") else ["env", f"XLA_FLAGS={devices.flags(1)}"]
-    )  # not on macOS
-    return [*(one_core if one_thread else []), sys.executable, "-m", "vecpsmbpo.cli", *arguments]
+    return [*(_one_core() if one_thread else []), sys.executable, "-m", "vecpsmbpo.cli", *arguments]
+
+
+def _one_core() -> list[str]:
+    """What a command begins with that shall have one core: of several pytest workers each another."""
+    if not shutil.which("taskset"):  # on macOS
+        return ["env", f"XLA_FLAGS={devices.flags(1)}"]
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    cores = sorted(os.sched_getaffinity(0))
+    return ["taskset", "-c", str(cores[worker % len(cores)])]
 
 
 def environment(count: int | None = None) -> dict[str, str]:
