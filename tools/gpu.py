@@ -46,7 +46,7 @@ class Part:
     trains: bool = False
 
 
-# The original simulator steps: on an H100 a step of MJX costs 10 ms, of C MuJoCo 0.05 (results/gpu/bench_envs.jsonl).
+# The original simulator steps: on an H100 a step of MJX costs 10 ms, of C MuJoCo 0.3 (results/gpu/bench_envs.jsonl).
 PAPER = ("env=hopper", "backend=host", "total_steps=40000", "seed=0")
 PARTS = (
     Part("hopper_stable", 9, (*PAPER, "recipe=stable"), trains=True),
