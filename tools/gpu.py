@@ -37,13 +37,21 @@ class Part:
 
     Attributes:
         words: of `vecpsmbpo train` where it trains, else of the tool that it names first.
+        tiny: with `size=tiny`, instead of the `words` of a tool.
         trains: whether it is a run.
     """
 
     name: str
     minutes: float
     words: tuple[str, ...]
+    tiny: tuple[str, ...] = ()
     trains: bool = False
+
+
+def _updates(name: str, *settings: str) -> Part:
+    """Updates per second of the paper's members, with `settings`."""
+    bench = ("bench.py", "updates")
+    return Part(name, 1.5, (*bench, "n_models=5", "n_policies=5", *settings), (*bench, "size=tiny", *settings))
 
 
 # The original simulator steps: on an H100 a step of MJX costs 10 ms, of C MuJoCo 0.3 (results/gpu/bench_envs.jsonl).
@@ -51,10 +59,18 @@ PAPER = ("env=hopper", "backend=host", "total_steps=40000", "seed=0")
 PARTS = (
     Part("hopper_stable", 9, (*PAPER, "recipe=stable"), trains=True),
     Part("hopper_paper", 9, (*PAPER, "recipe=paper"), trains=True),
-    Part("updates", 2, ("bench.py", "updates", "n_models=5", "n_policies=5")),
-    Part("updates_of_ten_seeds", 2, ("bench.py", "updates", "n_models=5", "n_policies=5", "num_seeds=10")),
-    Part("steps", 3, ("bench.py", "envs", "hopper", "ant")),
-    Part("parity", 2, ("parity.py", "hopper", "states=500", "episodes=5")),  # leaves parity_again.csv
+    _updates("updates"),
+    _updates("updates_of_ten_seeds", "num_seeds=10"),
+    _updates("updates_float32", "network_precision=float32"),
+    _updates("updates_bfloat16", "network_precision=bfloat16"),
+    Part("hosted", 1.5, ("bench.py", "hosted", "size=paper"), ("bench.py", "hosted", "size=tiny", "warmup_steps=80")),
+    Part("steps", 3, ("bench.py", "envs", "hopper", "ant"), ("bench.py", "envs", "cartpole_swingup")),
+    Part(  # leaves parity_again.csv
+        "parity",
+        2,
+        ("parity.py", "hopper", "states=500", "episodes=5"),
+        ("parity.py", "cartpole_swingup", "states=50", "episodes=1"),
+    ),
     Part("ant_stable", 9, ("env=ant", "backend=host", "total_steps=40000", "seed=0", "recipe=stable"), trains=True),
 )
 
@@ -143,9 +159,7 @@ def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     """Runs a tool once; what became of it."""
     if (out / f"{part.name}.json").exists():
         return "was measured before"
-    tool, *words = part.words
-    if tiny and tool == "bench.py" and words[0] == "updates":
-        words = ["updates", "size=tiny", *(word for word in words if word.startswith("num_seeds"))]
+    tool, *words = part.tiny if tiny else part.words
     table = out / f"{part.name}_again.csv"  # parity.csv is the whole one
     if tool == "parity.py":
         words.append(f"output={table}")

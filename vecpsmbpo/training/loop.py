@@ -26,6 +26,7 @@ from vecpsmbpo import (
     words,
 )
 from vecpsmbpo.drivers import Driver, Interrupted, Returns
+from vecpsmbpo.envs import speeds
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.look import render, report
 from vecpsmbpo.programs import evaluation_keys, initial_inputs, make_driver
@@ -186,6 +187,8 @@ class _Session:
             f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × {swept}"
             f"{settings.summary}, on {layout.mesh.size} {jax.default_backend()} device(s)"
         )
+        if hint := speeds.hint(settings.env, settings.backend, jax.default_backend(), len(settings.lanes)):
+            self.display.say(hint)
         self.display.say(f"memory: {self.memory}")
         where = f"resuming at step {self.env_steps}" if self.env_steps else "starting"
         self.display.say(f"run directory: {self.run_dir} ({where})")
