@@ -16,7 +16,7 @@ import pytest
 
 from tests import looks, shapes
 
-shapes.check_core()
+shapes.check_core()  # before anything imports it: fixtures import what they need
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
@@ -36,6 +36,29 @@ def mixed(tmp_path):
     return [ops, ps]
 
 
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """N = M = 2 on the original cartpole, two seeds; a session's only run that is looked at."""
+    from tests.helpers import command
+
+    folder = tmp_path_factory.mktemp("trained")
+    words = ["env=cartpole_swingup", "backend=host", "size=tiny", "total_steps=80", "report=true", "num_seeds=2"]
+    words += ["keep_checkpoints=3"]
+    result = command("train", *words, "run_dir=run", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def policy(trained):
+    """The best policy of its second seed, exported."""
+    from vecpsmbpo import cli
+
+    out = trained.parent / "policy"
+    assert cli.main(["export", str(trained), "lane=1", f"out={out}"]) == 0
+    return out
+
+
 LONGEST = (
     "test_resume",
     "test_drivers",
@@ -48,6 +71,7 @@ LONGEST = (
     "test_damage",
     "test_adapters",
     "test_members",
+    "test_export",
     "test_layout",
 )
 
