@@ -1,7 +1,11 @@
 """Where the time of an epoch goes."""
 
+import contextlib
+import dataclasses
 import sys
+import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,20 +15,23 @@ import numpy as np
 from tools.benches.program import driver_of
 from tools.benches.simulators import mjx_steps
 from tools.benches.timing import best_seconds
+from vecpsmbpo import jsonl, training
 from vecpsmbpo.drivers import ScanDriver
-from vecpsmbpo.layout import SEEDS
+from vecpsmbpo.layout import BY_SEED, SEEDS
 from vecpsmbpo.programs import initial_inputs
 from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.types import TrainState
 
 WORLD_STRIDES = 4
+ACTS = 200
 PROFILE_SECONDS = 150  # after which a large program's strides have been timed often enough
 
 
 def bench_profile() -> dict[str, Any]:
     """Strides of the real program are timed one by one: before the warm-up is over they are the world alone, then
     updates come on top, and at the start of every period a refresh. What cannot be told apart so is timed by itself.
-    A stride by itself pays for being started and for its news, which a run pays once for an epoch: it counts as acting.
+    A stride by itself pays for being started and for its news, which a run pays once for an epoch: it counts as
+    observing.
     """
     driver = driver_of([] if sys.argv[2:] else ["env=cartpole_swingup", "size=cpu"])
     settings, layout = driver.settings, driver.layout
@@ -52,6 +59,8 @@ def bench_profile() -> dict[str, Any]:
     stepping = (
         lanes * settings.epoch_steps / mjx_steps(settings.env, lanes, **dict(settings.env_options))["steps_per_s"]
     )
+    acting = settings.epoch_steps * seconds_per_act(driver, state)
+    # The last that uses the state, which it consumes.
     imagining = seconds_per_imagining(driver, state) * settings.refreshes_per_epoch if settings.imagines else 0.0
     refresh = settings.refreshes_per_epoch * max(np.mean(refreshing) - np.median(learning), 0.0)
     seconds_of = {
@@ -59,8 +68,10 @@ def bench_profile() -> dict[str, Any]:
         "fitting": max(refresh - imagining, 0.0),
         "imagining": imagining,
         "stepping": stepping,
-        "acting_and_observing": strides * np.median(world) - stepping,
+        "acting": acting,
+        "observing": max(strides * np.median(world) - stepping - acting, 0.0),
         "evaluating": evaluating,
+        "host": seconds_of_host(driver),
     }
     whole = sum(seconds_of.values())
     return {
@@ -108,3 +119,43 @@ def seconds_per_imagining(driver: ScanDriver, state: TrainState) -> float:
         state = jax.block_until_ready(run(state))
         seconds.append(time.perf_counter() - began)
     return min(seconds)
+
+
+def seconds_per_act(driver: ScanDriver, state: TrainState) -> float:
+    """Of drawing an action in every seed's environment."""
+
+    def body(state: TrainState) -> Any:
+        def act(carry, index):
+            keys = jax.vmap(lambda key: jax.random.fold_in(key, index))(state.seeds.key)
+            obs = state.env.obs + 1e-6 * carry[:, None]  # so that no two are the same
+            action, _ = over_seeds(driver.algorithm.act)(state.counters, state.seeds, obs, keys)
+            return carry + jnp.sum(action, axis=1), None
+
+        return jax.lax.scan(act, jnp.zeros(state.env.obs.shape[0]), jnp.arange(ACTS))[0]
+
+    run = driver.layout.jit_shard_map(body, (driver.layout.specs(),), BY_SEED)
+    jax.block_until_ready(run(state))
+    return best_seconds(lambda: run(state), 3) / ACTS
+
+
+def seconds_of_host(driver: ScanDriver) -> float:
+    """Of an epoch outside of the programs: logs, the display, a share of a checkpoint. Of a whole run that does not
+    learn, whose host does the same, with the programs' own time taken off."""
+    settings = driver.settings
+    epochs, steps = settings.checkpoint_every, settings.epoch_steps
+    with tempfile.TemporaryDirectory() as folder:
+        total = (1 + epochs) * steps
+        random = dataclasses.replace(settings, total_steps=total, warmup_steps=total, run_dir=str(Path(folder) / "run"))
+        with contextlib.redirect_stdout(sys.stderr):
+            training.train(random)
+        lines = jsonl.read(Path(random.run_dir) / jsonl.METRICS_FILE)
+    seconds = {line["env_steps"]: line["seconds"] for line in lines}
+    keys, given = initial_inputs(settings)
+    state = driver.init(keys, given)
+    programs = []
+    for _ in range(2):  # the first may have something to compile
+        began = time.perf_counter()
+        state, _ = driver.run(state, steps // settings.stride)
+        driver.evaluate(state, keys, settings.eval_episodes)
+        programs.append(time.perf_counter() - began)
+    return max((seconds[total] - seconds[steps]) / epochs - min(programs), 0.0)
