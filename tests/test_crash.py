@@ -13,6 +13,7 @@ from vecpsmbpo import crash, versions
 ENDS = {
     "segfault": "ctypes.string_at(0)",
     "abort": "os.abort()",
+    "abort in the middle of a line": 'os.write(2, b"terminate called after throwing an instance of \'"); os.abort()',
     "segfault in a thread": "ThreadPoolExecutor().submit(lambda: ctypes.string_at(0)).result()",
     "killed": "os.kill(os.getpid(), signal.SIGKILL)",
     "returns": "pass",
@@ -40,20 +41,26 @@ def run(program: str, cwd) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.parametrize(
-    ("end", "status", "reason"),
+    ("end", "status", "reason", "before"),
     [
-        ("segfault", -signal.SIGSEGV, "Segmentation fault"),
-        ("segfault in a thread", -signal.SIGSEGV, "Segmentation fault"),
-        ("abort", -signal.SIGABRT, "Aborted"),
+        ("segfault", -signal.SIGSEGV, "Segmentation fault", ""),
+        ("segfault in a thread", -signal.SIGSEGV, "Segmentation fault", ""),
+        ("abort", -signal.SIGABRT, "Aborted", "\n"),
+        (
+            "abort in the middle of a line",
+            -signal.SIGABRT,
+            "Aborted",
+            "terminate called after throwing an instance of '\n",
+        ),
     ],
 )
-def test_a_crash_ends_in_one_line_and_the_signals_own_status(end, status, reason, tmp_path):
+def test_a_crash_ends_in_one_line_and_the_signals_own_status(end, status, reason, before, tmp_path):
     result = run(PROGRAM.format(end=ENDS[end]), tmp_path)
     assert result.returncode == status
     report = tmp_path / "crash.txt"
     assert result.stderr == (
-        f"vecpsmbpo: crashed ({reason}) while compiling the training program, with {versions.line()}; {crash.ADVICE}; "
-        f"Python's stack is in {report}\n"
+        f"{before}vecpsmbpo: crashed ({reason}) while compiling the training program, with {versions.line()}; "
+        f"{crash.ADVICE}; Python's stack is in {report}\n"
     )
     assert reason in report.read_text()
     assert 'File "<string>", line' in report.read_text()

@@ -91,7 +91,9 @@ def _watch(pipe: int) -> None:
     with open(pipe, errors="replace") as file:
         story = file.read()  # until the process is gone
     if text := obituary(story):
-        print(text, file=sys.stderr, flush=True)
+        # C++ tells what it aborts for, and may not have come to the end of its line: ours begins a new one.
+        torn = f"{_FATAL}Aborted" in story
+        print(f"\n{text}" if torn else text, file=sys.stderr, flush=True)
 
 
 def obituary(story: str) -> str | None:

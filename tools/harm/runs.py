@@ -78,7 +78,8 @@ def one_line(status: int, errors: str, expected: int | None = 2) -> str:
     if expected is None:
         expected = status or 1
     told = [line for line in errors.splitlines() if line.startswith("vecpsmbpo: ") and "warning" not in line]
-    others = [line for line in errors.splitlines() if not line.startswith("vecpsmbpo: ") and not NATIVE.match(line)]
+    rest = [line for line in errors.splitlines() if line and not line.startswith("vecpsmbpo: ")]
+    others = [line for line in rest if not NATIVE.match(line)]
     if (status, len(told), others) == (expected, 1, []):
         return ONE_LINE
     return f"status {status}, {len(told)} line(s), and besides {' '.join(others)[-200:]!r}"
