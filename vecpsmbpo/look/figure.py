@@ -206,7 +206,7 @@ def _no_episodes(run: Run) -> SettingError:
 
 
 def draw_averages(experiment: Experiment) -> "Figure":
-    """Figure 6: a policy sampled for each episode (solid) against the average of all (dashed), by M."""
+    """Figure 6: a policy sampled for each episode (solid) against the average of all (dashed, hollow marks), by M."""
     from vecpsmbpo.look import style
 
     _check_evaluated(experiment)
@@ -218,7 +218,9 @@ def draw_averages(experiment: Experiment) -> "Figure":
             m, average = one.values["n_policies"], one.values["posterior"] == "average"
             look = looks[m]._replace(dashes="--" if average else "-")
             name = f"M = {m}, {'average' if average else 'sampled'}"
-            style.line(axis, look, line.x, line.y, low=line.low, high=line.high, label=name)
+            # A legend's piece of a line is too short to show dashes.
+            hollow = {"mfc": style.PAPER} if average else {}
+            style.line(axis, look, line.x, line.y, low=line.low, high=line.high, label=name, **hollow)
     style.legend(figure, figure.axes, columns=3)
     return figure
 
