@@ -14,8 +14,8 @@ ENOUGH = 1.5  # times as fast, to be worth a line: the way from the device and b
 def hint(name: str, backend: str, platform: str, lanes: int) -> str:
     """A line for whom MJX, which `backend=auto` takes, steps more slowly than the original; else nothing.
 
-    On a CPU that is true of robots, too, but what is around a step of the original takes longer than what it saves
-    (`tools/bench.py hosted`).
+    On a CPU it is true of robots, too, but there what is around a step of the original may cost more than it saves
+    (`tools/bench.py hosted`): nothing is said.
 
     Args:
         platform: as `jax.default_backend` names it.

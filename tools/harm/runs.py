@@ -26,6 +26,8 @@ NATIVE = re.compile(
     r"terminate called|  what\(\):  |LLVM ERROR: |[EF]\d{4} [\d:.]+ +\d+ \w+\.cc:\d+\] "
     r"|Exception ignored in sys\.unraisablehook|MemoryError$"
 )
+# The end of the line that an abort may have torn; an empty one where it did not.
+BEGUN_ANEW = re.compile(r"(^|\n)\n(?=vecpsmbpo: crashed \(Aborted\))")
 SAME, SAID, ONE_LINE = "same end", "same state, lost lines are said", "one line"
 FINE = (SAME, SAID, ONE_LINE)
 # What is tried, and what tries it and returns how it ended: one of FINE, or what was wrong.
@@ -77,9 +79,9 @@ def one_line(status: int, errors: str, expected: int | None = 2) -> str:
     """`expected`: the exit status; None is any but 0: how a process ends that gets no memory, the system says."""
     if expected is None:
         expected = status or 1
+    errors = BEGUN_ANEW.sub(r"\1", errors)
     told = [line for line in errors.splitlines() if line.startswith("vecpsmbpo: ") and "warning" not in line]
-    rest = [line for line in errors.splitlines() if line and not line.startswith("vecpsmbpo: ")]
-    others = [line for line in rest if not NATIVE.match(line)]
+    others = [line for line in errors.splitlines() if not line.startswith("vecpsmbpo: ") and not NATIVE.match(line)]
     if (status, len(told), others) == (expected, 1, []):
         return ONE_LINE
     return f"status {status}, {len(told)} line(s), and besides {' '.join(others)[-200:]!r}"
