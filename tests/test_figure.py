@@ -1,4 +1,4 @@
-"""The paper's figures: from logs that no training wrote, and (slow) from runs of `size=tiny`."""
+"""The paper's figures, from logs that no training wrote. (From runs: test_run.py, slow.)"""
 
 import json
 import sys
@@ -9,7 +9,6 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests import looks
-from tests.helpers import command
 from vecpsmbpo import cli, config
 from vecpsmbpo.look import experiments, figure, groups, states, style
 
@@ -76,45 +75,6 @@ def test_every_figure_is_drawn_and_says_what_is_missing(name, tmp_path, monkeypa
     if swept:
         assert said[-1].startswith(f"vecpsmbpo: warning: {name}: 0 of 1 seeds of env=")
         assert SWEPT[name][0] in said[-1]
-
-
-# Of each grid one task, or two where the figure sets tasks side by side, and two values of what it compares.
-TRAINED = {
-    "fig2": [],
-    "fig4": ["env=hopper,halfcheetah", "algo=ops_mbpo,pets"],
-    "fig5": ["env=ball_in_cup,window_open", "algo=slbo,sac"],
-    "fig6": ["env=cartpole_swingup_sparse", "n_policies=1,3"],
-    "fig7": ["n_models=1,2", "n_policies=1,2"],
-    "fig8": [],
-    "fig9": [],
-    "fig10": [],
-    "fig11": ["env=hopper"],
-    "fig12": ["env=ball_in_cup"],
-    "fig13": ["env=cartpole_swingup_sparse"],
-    "fig15": ["env=hopper,halfcheetah"],
-    "fig16": ["env=hopper,window_open"],
-    "fig17": ["env=hopper,window_open"],
-    "fig18": ["env=hopper"],
-    "fig19": ["env=ball_in_cup"],
-    "table1": ["env=hopper,ball_in_cup"],
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(figure.DRAW))
-def test_every_figure_is_drawn_from_runs_that_were_trained(name, tmp_path):
-    if figure.DRAW[name] is figure.draw_states:
-        pytest.importorskip("umap")
-    words = ["-m", f"experiment={name}", "size=tiny", "backend=host", *TRAINED[name]]
-    trained = command("train", *words, cwd=tmp_path)
-    assert trained.returncode == 0, trained.stderr
-    drawn = command("figure", name, "size=tiny", cwd=tmp_path)
-    assert drawn.returncode == 0, drawn.stderr
-    said = [line for line in drawn.stderr.splitlines() if line.startswith("vecpsmbpo: ")]
-    assert all(line.startswith(f"vecpsmbpo: warning: {name}: no run of ") for line in said)  # of the rest of the grid
-    assert len(said) <= 1
-    if name != "table1":
-        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_figure_2_accumulates_what_was_missed(tmp_path):

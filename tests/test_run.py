@@ -65,6 +65,7 @@ def test_every_experiment_runs(experiment, tmp_path):
     if experiment not in ("fig8", "fig18", "fig19") or importlib.util.find_spec("umap"):
         drawn = command("figure", experiment, "size=tiny", cwd=tmp_path)
         assert drawn.returncode == 0, drawn.stderr
+        assert experiment == "table1" or (tmp_path / f"{experiment}.png").read_bytes().startswith(b"\x89PNG")
 
 
 def _swept(experiment: str, name: str) -> list[str]:
