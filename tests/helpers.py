@@ -12,12 +12,12 @@ import jax
 import numpy as np
 
 from tests import devices
-from vecpsmbpo import config, evaluate, metrics, placement
+from vecpsmbpo import config, dynamics, evaluate, metrics, placement
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.programs import initial_inputs, make_algorithm
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import EnvSpec, SeedState
+from vecpsmbpo.types import EnvSpec, Hyper, Model, SeedState
 
 METRICS = {
     "env_steps", "seed", "eval_return", "eval_length", "train_return", "model_loss", "model_val_mse", "critic_loss",
@@ -32,6 +32,12 @@ EPISODE = {
 def tiny(**changes: Any) -> Settings:
     """`size=tiny` with changes."""
     return config.compose(["size=tiny", *(f"{name}={value}" for name, value in changes.items())])
+
+
+def new_model(key: jax.Array, settings: Settings, spec: EnvSpec, hyper: Hyper | None = None) -> Model:
+    """A dynamics model before its first fit."""
+    net = dynamics.network(settings, spec)
+    return dynamics.init(key, hyper or Hyper.of(settings), net=net, settings=settings, spec=spec)
 
 
 def algorithm(settings: Settings, spec: EnvSpec) -> Any:

@@ -23,7 +23,7 @@ from tests.helpers import (
 )
 from tools.harm.runs import NotTried
 from tools.harm.scarce import mounted
-from vecpsmbpo import config, evaluate, jsonl, metrics, placement, recorded, training
+from vecpsmbpo import cli, config, evaluate, jsonl, metrics, placement, recorded, training
 from vecpsmbpo.drivers.host import HostDriver
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.envs.host.dm_control import DmControlSimulator
@@ -211,12 +211,15 @@ def test_a_simulator_that_fails_costs_its_stride_and_no_more(short_run, tmp_path
         return step(self, action)
 
     monkeypatch.setattr(DmControlSimulator, "step", breaks)
-    assert training.train(settings) == 1
+    assert cli._run(settings) == (1, True)
     monkeypatch.undo()
     said = capsys.readouterr()
     saved = evaluate.restore(settings)[1].step
     assert 0 < saved < 66
-    assert re.search(rf"ball_in_cup failed at step \d+: SystemExit: 0 at .*; saved at step {saved}; to cont", said.err)
+    assert re.fullmatch(
+        rf"vecpsmbpo: ball_in_cup failed at step \d+: SystemExit: 0 at .*; saved at step {saved}; to continue: .*\n",
+        said.err,
+    )
     assert said.err.rstrip().endswith(
         """to continue: vecpsmbpo train 'run_dir='"'"'""" + str(tmp_path) + """/a b=c'"'"''"""
     )
@@ -239,9 +242,9 @@ def test_a_simulator_that_fails_in_an_evaluation_costs_no_training(failing, shor
 
     monkeypatch.setattr(HostDriver, "evaluate", fails)
     for _ in range(2):
-        assert training.train(settings) == 1
-        said = capsys.readouterr().err
-        assert f"failed in the evaluation at step {failing}: out of coal; saved at step {failing}; to cont" in said
+        said = f"failed in the evaluation at step {failing}: out of coal; saved at step {failing}; to continue"
+        with pytest.raises(training.TaskFailed, match=said):
+            training.train(settings)
         assert jsonl.read(tmp_path / "run" / "metrics.jsonl")[-1]["env_steps"] == failing - 40
     monkeypatch.undo()
     if failing < settings.total_steps:
@@ -268,11 +271,10 @@ def test_a_simulator_that_fails_at_its_first_reset_leaves_all_as_it_was(
         raise ValueError("no coal")
 
     monkeypatch.setattr(DmControlSimulator, "load" if begun else "reset", fails)
-    assert training.train(settings) == 1
-    line = (
-        r"vecpsmbpo: ball_in_cup failed before its first step: ValueError: no coal at \S+; nothing has been changed\n"
-    )
-    assert re.fullmatch(line, capsys.readouterr().err)
+    line = r"^ball_in_cup failed before its first step: ValueError: no coal at \S+; nothing has been changed$"
+    with pytest.raises(training.TaskFailed, match=line):
+        training.train(settings)
+    assert capsys.readouterr().err == ""
     assert _files(tmp_path) == before
     assert begun or not list(tmp_path.iterdir())
 

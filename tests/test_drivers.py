@@ -32,7 +32,7 @@ def settings_for(**changes):
         "model_hidden_size": 32,
         "model_batch_size": 32,
         "model_max_epochs": 40,
-        **({} if changes.get("algo") == "sac" else {"rollout_starts": 100}),
+        "rollout_starts": 100,
         "model_update_every": 40,
         "policy_hidden_size": 16,
         "policy_batch_size": 32,

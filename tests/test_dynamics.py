@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.helpers import tiny
+from tests.helpers import new_model, tiny
 from vecpsmbpo import dynamics, replay
 from vecpsmbpo.types import EnvSpec, Hyper, Moments, Scaling, Transition
 
@@ -53,14 +53,15 @@ def _compiled_fit(settings, usual):
     def run(model, count, key, rows=usual, hyper=usual_hyper):
         split = dynamics.Split.draw(key, count, CAPACITY, settings.validation_block)
         whitening = dynamics.scaling(_moments(rows), jnp.int32(CAPACITY), settings)
-        return dynamics.fit(model, rows, split, whitening, hyper, key, settings=settings, spec=SPEC)
+        net = dynamics.network(settings, SPEC)
+        return dynamics.fit(model, rows, split, whitening, hyper, key, net=net, settings=settings, spec=SPEC)
 
     return run
 
 
 def test_fit_learns_the_mean_and_the_noise(linear, fit, key):
     settings, _ = linear
-    model = dynamics.init(key, Hyper.of(settings), settings, SPEC)
+    model = new_model(key, settings, SPEC)
     fitted = fit(model, jnp.int32(CAPACITY), key)
     obs, action = jnp.array([[0.5, -0.5]]), jnp.array([[1.0]])
     mean, log_variance, _ = dynamics.forward(fitted, obs, action, net=dynamics.network(settings, SPEC))
@@ -72,7 +73,7 @@ def test_fit_learns_the_mean_and_the_noise(linear, fit, key):
 
 def test_a_data_set_that_grows_needs_no_new_program(linear, fit, key):
     settings, _ = linear
-    model = dynamics.init(key, Hyper.of(settings), settings, SPEC)
+    model = new_model(key, settings, SPEC)
     for rows in (5, 64, 777, CAPACITY):
         model = fit(model, jnp.int32(rows), key)
     assert fit._cache_size() == 1
@@ -84,7 +85,7 @@ def test_the_best_epoch_is_kept(linear, key):
     that a fit reports is that of the parameters it hands back."""
     settings, rows = linear
     hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(0.1))
-    model = dynamics.init(key, hyper, settings, SPEC)
+    model = new_model(key, settings, SPEC, hyper)
     split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
     validation, exists = split.validation_rows(jnp.int32(0), CAPACITY, settings.validation_block)
     held_out = rows[validation[exists]]
@@ -104,7 +105,7 @@ def test_a_fit_stops_after_its_patience(linear, fit, key):
     """With a learning rate of 0 the first epoch's error is never improved on."""
     settings, _ = linear
     hyper = Hyper.of(settings).replace(model_learning_rate=jnp.float32(0.0))
-    model = dynamics.init(key, hyper, settings, SPEC)
+    model = new_model(key, settings, SPEC, hyper)
     after = fit(model, jnp.int32(CAPACITY), key, hyper=hyper)
     jax.tree.map(np.testing.assert_array_equal, after.params, model.params)
     steps = jax.tree.leaves(after.optimizer)[0] - jax.tree.leaves(model.optimizer)[0]
@@ -116,7 +117,7 @@ def test_what_cannot_be_predicted_does_not_keep_the_rest_from_being_learned(line
     """Impacts at random moments make up nearly all of the error. The other coordinate's rule, new, is less than
     the threshold's 1% of it, and is learned all the same."""
     settings, rows = linear
-    model = fit(dynamics.init(key, Hyper.of(settings), settings, SPEC), jnp.int32(CAPACITY), key)
+    model = fit(new_model(key, settings, SPEC), jnp.int32(CAPACITY), key)
     impact = 10.0 * jax.random.bernoulli(key, 0.1, (CAPACITY,))
     new_rule = rows.at[:, 3].add(impact).at[:, 4].set(rows[:, 1] + 0.2 * rows[:, 0])
     after = fit(model, jnp.int32(CAPACITY), key, new_rule)
@@ -157,9 +158,10 @@ def test_where_the_rule_is_not_known_termination_is_learned(linear, key):
     def run(key):
         split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, settings.validation_block)
         whitening = Scaling(jnp.zeros(3), jnp.ones(3), jnp.ones(3))
-        model = dynamics.init(key, Hyper.of(settings), settings, spec)
+        model = new_model(key, settings, spec)
         hyper = Hyper.of(settings)
-        return dynamics.fit(model, rows, split, whitening, hyper, key, settings=settings, spec=spec)
+        net = dynamics.network(settings, spec)
+        return dynamics.fit(model, rows, split, whitening, hyper, key, net=net, settings=settings, spec=spec)
 
     fitted = run(key)
     obs = jnp.array([[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [2.0, -1.0]])
@@ -187,9 +189,10 @@ def test_whitened_targets_resolve_changes_that_the_variance_floor_hides(linear, 
         def run(key, chosen=chosen):
             split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, chosen.validation_block)
             hyper = Hyper.of(chosen)
-            model = dynamics.init(key, hyper, chosen, SPEC)
+            model = new_model(key, chosen, SPEC, hyper)
             whitening = dynamics.scaling(_moments(small), jnp.int32(CAPACITY), chosen)
-            return dynamics.fit(model, small, split, whitening, hyper, key, settings=chosen, spec=SPEC)
+            net = dynamics.network(chosen, SPEC)
+            return dynamics.fit(model, small, split, whitening, hyper, key, net=net, settings=chosen, spec=SPEC)
 
         fitted = run(key)
         obs, action = small[:, :2], small[:, 2:3]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from tests.helpers import tiny
+from tests.helpers import new_model, tiny
 from vecpsmbpo import dynamics, imagination, networks, posterior, sac
 from vecpsmbpo.envs import specs
 from vecpsmbpo.types import Hyper, Moments, Posterior, Transition
@@ -67,7 +67,7 @@ def test_prediction_adds_the_residual_to_the_state_and_whitens_its_inputs(key):
 def test_predictions_are_drawn_with_the_network_s_variance(key):
     """Equation 21: a raw log-variance of 0 is -0.126877 after A.1's clamp, a deviation of 0.93853."""
     settings, spec = tiny(), specs.get("ball_in_cup")
-    model = dynamics.init(key, Hyper.of(settings), settings, spec)
+    model = new_model(key, settings, spec)
     model = model.replace(params=jax.tree.map(jnp.zeros_like, model.params))
     net = dynamics.network(settings, spec)
     obs, action = jnp.full((20_000, spec.obs_size), 5.0), jnp.zeros((20_000, spec.action_size))

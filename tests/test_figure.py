@@ -272,7 +272,7 @@ def shelf(tmp_path, monkeypatch):
     [
         ([], "figure: takes the name of one; one of fig2, fig4"),
         (["fig3"], "figure: fig3 is a drawing and is left out; one of fig2"),
-        (["fig99"], "figure: takes the name of one"),
+        (["fig99"], "figure: fig99 is no figure of the paper; one of fig2"),
         (["fig2"], "fig2: there are no runs in runs/fig2; to make them: vecpsmbpo train -m experiment=fig2 size=cpu"),
         (["fig9"], "size: the runs in runs/fig9 are of sizes cpu, tiny; say size=, one of them"),
         (

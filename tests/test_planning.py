@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from tests import helpers
-from tests.helpers import tiny
+from tests.helpers import new_model, tiny
 from tests.test_drivers import make_driver
 from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics
 from vecpsmbpo.algorithms.pets import planning
 from vecpsmbpo.programs import evaluation_keys, initial_inputs
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.types import EnvSpec, Hyper
+from vecpsmbpo.types import EnvSpec
 
 LIMIT = 3.5
 SPEC = EnvSpec("counter", obs_size=1, action_size=1, episode_length=10, terminated=lambda o, a, n: n[..., 0] > LIMIT)
@@ -48,7 +48,7 @@ def test_cross_entropy_begins_where_it_is_told(key):
 
 def _counters(settings):
     """Two models: model n adds 2 n + 1 to the state, and pays 10 n + 1."""
-    models = [dynamics.init(jax.random.key(0), Hyper.of(settings), settings, SPEC)] * 2
+    models = [new_model(jax.random.key(0), settings, SPEC)] * 2
     answers = [jnp.array([2.0 * n + 1, 10.0 * n + 1, -1e3, -1e3]) for n in range(2)]
     models = [
         model.replace(params=constant(model.params, answer)) for model, answer in zip(models, answers, strict=True)
@@ -90,7 +90,7 @@ def test_the_two_ways_of_sampling_differ():
 def test_each_action_is_held_and_reaches_the_model(key):
     """A model that moves the state by the action: a plan (a, b) held for 3 steps each moves it by 3 a + 3 b."""
     settings = tiny(algo="pets", plan_particles=2, plan_horizon=2, plan_hold=3, model_hidden_layers=1)
-    model = dynamics.init(key, Hyper.of(settings), settings, SPEC)
+    model = new_model(key, settings, SPEC)
     params = jax.tree.map(jnp.zeros_like, model.params)["params"]
     # swish(x) ≈ x for large x: hidden unit 0 carries 100 + a, and the outputs take 100 away. The reward is the state.
     params["Dense_0"]["kernel"] = params["Dense_0"]["kernel"].at[1, 0].set(1.0).at[0, 1].set(1.0)

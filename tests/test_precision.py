@@ -10,7 +10,7 @@ from vecpsmbpo import dynamics, networks, sac
 from vecpsmbpo.envs import specs
 from vecpsmbpo.types import Hyper, Transition
 
-from .helpers import tiny
+from .helpers import new_model, tiny
 
 SPEC = specs.get("hopper")
 OBS, ACTION, BATCH = SPEC.obs_size, SPEC.action_size, 8
@@ -87,7 +87,7 @@ def test_bfloat16_rounds_what_critics_say_by_its_eight_bits(norm, key):
 def test_models_predict_alike_in_bfloat16(key):
     def predict(precision):
         settings = tiny(network_precision=precision)
-        model = dynamics.init(key, Hyper.of(settings), settings, SPEC)
+        model = new_model(key, settings, SPEC)
         obs, action = jax.random.normal(key, (64, OBS)), jnp.zeros((64, ACTION))
         return np.asarray(dynamics.forward(model, obs, action, net=dynamics.network(settings, SPEC)).mean)
 

@@ -10,7 +10,7 @@ import scipy.stats
 from jax.flatten_util import ravel_pytree
 
 from tests.helpers import algorithm as make_algorithm
-from tests.helpers import tiny
+from tests.helpers import new_model, tiny
 from tests.test_drivers import make_driver
 from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, replay
@@ -19,7 +19,7 @@ from vecpsmbpo.envs import specs
 from vecpsmbpo.look import export
 from vecpsmbpo.programs import evaluation_keys, initial_inputs
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.types import EnvSpec, Hyper, Scaling, Transition
+from vecpsmbpo.types import EnvSpec, Scaling, Transition
 
 SPEC = specs.get("ball_in_cup")
 NETS = trpo.make_networks(tiny(algo="slbo", policy_hidden_size=6), SPEC)
@@ -143,7 +143,7 @@ LINE = EnvSpec("line", obs_size=2, action_size=1, episode_length=10, terminated=
 def test_the_multistep_loss_by_hand(key):
     """A model that always moves by (1, 2) and pays 3, on two true steps of (1, 2), 3 and (4, 6), 7."""
     settings = tiny(algo="slbo")
-    model = dynamics.init(key, Hyper.of(settings), settings, LINE)
+    model = new_model(key, settings, LINE)
     model = model.replace(
         params=constant(model.params, jnp.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])),
         scaling=model.scaling._replace(input_std=jnp.array([1.0, 2.0, 1.0])),

@@ -10,7 +10,7 @@ import scipy.integrate
 import scipy.stats
 
 from tests import probes
-from tests.helpers import algorithm, assert_probabilities_follow, tiny
+from tests.helpers import algorithm, assert_probabilities_follow, new_model, tiny
 from tests.test_drivers import make_driver, settings_for
 from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, posterior, sac
@@ -33,8 +33,8 @@ def test_forced_exploration_by_hand():
 def test_the_prior_is_added_to_the_network_and_never_fitted(key):
     settings, spec = tiny(prior_scale=0.3), specs.get("hopper")
     hyper = Hyper.of(settings)
-    model = dynamics.init(key, hyper, settings, spec)
-    plain = dynamics.init(key, hyper, tiny(), spec)
+    model = new_model(key, settings, spec, hyper)
+    plain = new_model(key, tiny(), spec, hyper)
     jax.tree.map(np.testing.assert_array_equal, model.params, plain.params)  # nothing else is drawn differently
     assert plain.prior is None
     net = dynamics.network(settings, spec)

@@ -4,6 +4,7 @@ run = vecpsmbpo.train(env="cartpole_swingup", size="cpu", run_dir="runs/x")
 run = vecpsmbpo.load("runs/x")
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -25,18 +26,23 @@ def __getattr__(name: str) -> Any:
         from vecpsmbpo.settings import SettingError
 
         return SettingError
+    if name == "envs":
+        return importlib.import_module("vecpsmbpo.envs")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def train(**settings: Any) -> "Run":
     """Trains, as `vecpsmbpo train` does: see `api.train`."""
-    from vecpsmbpo import api
-
-    return api.train(**settings)
+    return _api().train(**settings)
 
 
 def load(path: "str | Path", lane: int = 0) -> "Run | Policy":
     """The run, or the exported policy, in a directory: see `api.Run` and `api.Policy`."""
-    from vecpsmbpo import api
+    return _api().load(path, lane)
 
-    return api.load(path, lane)
+
+def _api() -> Any:
+    from vecpsmbpo import limits
+
+    limits.check_start()
+    return importlib.import_module("vecpsmbpo.api")

@@ -217,10 +217,12 @@ def train(**settings: Any) -> Run:
     """Trains, as `vecpsmbpo train` does: the same names, checks and files.
 
     `env.*` and `sweep.*` are `env_options={...}` and `sweep={...}`. A `run_dir` that holds a run goes on with it.
-    Ctrl-C finishes the running chunk, saves, and returns; the run is then not `complete`.
+    Ctrl-C finishes the running chunk, saves, and returns; the run is then not `complete`. A lane in which something
+    stopped being finite is held there (`health`): `frozen` says so in its last row of `metrics`.
 
     Raises:
         SettingError: a mistake in the settings, in one line.
+        training.TaskFailed: the task's own code did, and how to go on.
         training.DiskError: the run directory cannot be written.
         training.OutOfMemory: the system gives no more.
     """

@@ -219,7 +219,7 @@ def _to_host(state: TrainState, layout: Layout) -> dict[str, Any]:
 def _shapes_on_host(shapes: TrainState, layout: Layout) -> dict[str, Any]:
     """What `_to_host` gives, as shapes."""
 
-    counts = {"real": layout.num_seeds, "imagined": layout.num_seeds * layout.n_members}
+    counts = {"real": layout.num_lanes, "imagined": layout.num_lanes * layout.n_members}
     rings = {
         name: [jax.ShapeDtypeStruct(ring.shape[-2:], ring.dtype)] * counts[name]
         for name, ring in shapes.seeds.rings().items()

@@ -127,12 +127,13 @@ def _importing_jax() -> Iterator[None]:
 def _run(settings: Settings) -> tuple[int, bool]:
     """Trains; the exit status, and whether the process may end as processes do."""
     with _importing_jax():
-        from vecpsmbpo import processes, runtime
-        from vecpsmbpo.training import DiskError, OutOfMemory, train
-
-        runtime.check_flags()
+        from vecpsmbpo import processes
+        from vecpsmbpo.training import DiskError, OutOfMemory, TaskFailed, train
     try:
         return train(settings), True
+    except TaskFailed as error:
+        words.complain(error)
+        return 1, True
     except (DiskError, OutOfMemory, processes.LostProcess, SettingError) as error:
         alone = not isinstance(error, processes.NotTogether) and not processes.are_several()
         if isinstance(error, SettingError) and alone:
@@ -229,10 +230,7 @@ def _eval(rest: list[str]) -> int:
         stored = config.load(run_dir)
         settings = config.for_evaluation(stored, given)
     with _importing_jax():
-        from vecpsmbpo import runtime
         from vecpsmbpo.evaluate import show
-
-        runtime.check_flags()
     return exported.show(policy, settings) if policy else show(stored, settings)
 
 

@@ -54,6 +54,8 @@ class Split(NamedTuple):
 
 
 def network(settings: Settings, spec: EnvSpec) -> networks.GaussianMLP:
+    """[..., O + A], whitened -> Gaussians of (Δs, r) [..., O + 1]; where nobody knows the task's rule of termination,
+    its logit, too."""
     return networks.GaussianMLP(
         output_size=spec.obs_size + 1,
         hidden_size=settings.model_hidden_size,
@@ -63,9 +65,9 @@ def network(settings: Settings, spec: EnvSpec) -> networks.GaussianMLP:
     )
 
 
-def init(key: PRNGKeyArray, hyper: Hyper, settings: Settings, spec: EnvSpec) -> Model:
-    size = spec.obs_size + spec.action_size
-    net, zero = network(settings, spec), jnp.zeros(())
+def init(key: PRNGKeyArray, hyper: Hyper, *, net: networks.GaussianMLP, settings: Settings, spec: EnvSpec) -> Model:
+    """Drawn at random, a prior as well where there is one, and without units (`scaling`) until the first fit."""
+    size, zero = spec.obs_size + spec.action_size, jnp.zeros(())
     params = net.init(key, jnp.zeros(size))
     prior = None
     if settings.has_prior:
@@ -189,10 +191,11 @@ def fit(
     model: Model,
     real: Float[Array, "C F"],
     split: Split,
-    whitening: Scaling,
+    scaling: Scaling,
     hyper: Hyper,
     key: PRNGKeyArray,
     *,
+    net: networks.GaussianMLP,
     settings: Settings,
     spec: EnvSpec,
 ) -> Model:
@@ -207,10 +210,10 @@ def fit(
     Args:
         real: D_E.
         split: which of its rows train and which validate.
-        whitening: of its rows.
+        scaling: of its rows.
     """
-    net, block = network(settings, spec), settings.validation_block
-    model = model.replace(scaling=whitening)
+    block = settings.validation_block
+    model = model.replace(scaling=scaling)
 
     def rows_of(indices: jax.Array) -> Transition:
         return replay.unpack(real[indices], spec.obs_size, spec.action_size)

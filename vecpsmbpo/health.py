@@ -17,30 +17,30 @@ from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Health, SeedState, TrainState
 
-# A place is a code: a rank times `_WIDTH` plus the index of a member or model. Ranks are the entries of `SEEN` and then
-# the leaves of the state. Of several places the smallest leaf is named; what passed by is as a rule its consequence.
+# A code is a rank times `_WIDTH` plus the index of a member or model. Ranks are the entries of `PASSING` and then
+# the leaves of the state. Of several the smallest leaf is named; what passed by is as a rule its consequence.
 NOWHERE = np.int32(2**31 - 1)
 _WIDTH = 2**16
 ACTION, IMAGINED = "an action", "imagined data"
-SEEN = (ACTION, IMAGINED)
+PASSING = (ACTION, IMAGINED)
 MODELS, AGENTS = "models", "agents"
 
 
 def init() -> Health:
     """All is well."""
     nowhere = jnp.int32(NOWHERE)
-    return Health(place=nowhere, env_steps=jnp.int32(0), seen=nowhere)
+    return Health(code=nowhere, env_steps=jnp.int32(0), passing=nowhere)
 
 
 def note(health: Health, what: str, bad: jax.Array, member: jax.Array | int = 0) -> Health:
-    """Remembers, where `bad`, that `what` of `SEEN` was not finite."""
-    code = jnp.where(bad, SEEN.index(what) * _WIDTH + member, NOWHERE)
-    return health.replace(seen=jnp.minimum(health.seen, code))
+    """Remembers, where `bad`, that `what` of `PASSING` was not finite."""
+    code = jnp.where(bad, PASSING.index(what) * _WIDTH + member, NOWHERE)
+    return health.replace(passing=jnp.minimum(health.passing, code))
 
 
 def frozen(health: Health) -> Any:
     """Which lanes are, [S] bool (or [] of one)."""
-    return health.place != NOWHERE
+    return health.code != NOWHERE
 
 
 def settle(layout: Layout, before: TrainState, after: TrainState) -> tuple[TrainState, jax.Array]:
@@ -54,11 +54,11 @@ def settle(layout: Layout, before: TrainState, after: TrainState) -> tuple[Train
     """
     was, seeds = before.seeds.health, after.seeds
     found = jax.vmap(partial(_first_not_finite, layout))(seeds)
-    found = jnp.where(found == NOWHERE, seeds.health.seen, found)
-    place = jnp.where(frozen(was), was.place, found)
-    now = place != NOWHERE
+    found = jnp.where(found == NOWHERE, seeds.health.passing, found)
+    code = jnp.where(frozen(was), was.code, found)
+    now = code != NOWHERE
     env_steps = jnp.where(now & ~frozen(was), after.counters.env_steps, was.env_steps)
-    health = Health(place=place, env_steps=env_steps, seen=jnp.full_like(place, NOWHERE))
+    health = Health(code=code, env_steps=env_steps, passing=jnp.full_like(code, NOWHERE))
 
     held = jax.tree.map(
         lambda old, new: jax.vmap(jnp.where)(now, old, new),
@@ -89,10 +89,10 @@ def _leaves(seeds: SeedState) -> list[tuple[str, str, Any]]:
 
 
 def _first_not_finite(layout: Layout, state: SeedState) -> jax.Array:
-    """The place of it in one seed, [] int32; members and models that fill the mesh do not count."""
+    """The code of it in one seed, [] int32; members and models that fill the mesh do not count."""
     own = {MODELS: (layout.model_ids(), layout.n_models), AGENTS: (layout.member_ids(), layout.n_members)}
     found = jnp.int32(NOWHERE)
-    for rank, (part, _, leaf) in enumerate(_leaves(state), start=len(SEEN)):
+    for rank, (part, _, leaf) in enumerate(_leaves(state), start=len(PASSING)):
         ids, count = own.get(part, (jnp.zeros(1, jnp.int32), 1))
         bad = ~jnp.isfinite(leaf).reshape(ids.shape[0], -1).all(axis=1) & (ids < count)
         found = jnp.minimum(found, jnp.min(jnp.where(bad, rank * _WIDTH + ids, NOWHERE)))
@@ -101,11 +101,11 @@ def _first_not_finite(layout: Layout, state: SeedState) -> jax.Array:
 
 def describe(seeds: SeedState, lane: int, settings: Settings) -> str:
     """Where the fault of a frozen lane appeared, in words."""
-    rank, index = divmod(int(seeds.health.place[lane]), _WIDTH)
-    if rank < len(SEEN):
-        part, name = (AGENTS if SEEN[rank] == IMAGINED else ""), SEEN[rank]
+    rank, index = divmod(int(seeds.health.code[lane]), _WIDTH)
+    if rank < len(PASSING):
+        part, name = (AGENTS if PASSING[rank] == IMAGINED else ""), PASSING[rank]
     else:
-        part, name, _ = _leaves(seeds)[rank - len(SEEN)]
+        part, name, _ = _leaves(seeds)[rank - len(PASSING)]
     if part == MODELS:
         return f"{name} of model n = {index}"
     if part == AGENTS:

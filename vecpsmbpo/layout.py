@@ -16,11 +16,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from vecpsmbpo import processes
+from vecpsmbpo import empty_arrays, processes
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import SeedState, TrainState
 
@@ -37,7 +36,7 @@ class Layout:
 
     Attributes:
         mesh: of devices, axes `seeds` × `members`.
-        num_seeds: S.
+        num_lanes: S.
         n_models: N.
         n_policies: M.
         n_members: N·M, or M where policies do not belong to models.
@@ -49,7 +48,7 @@ class Layout:
     """
 
     mesh: Mesh
-    num_seeds: int
+    num_lanes: int
     n_models: int
     n_policies: int
     n_members: int
@@ -67,7 +66,7 @@ class Layout:
         grid = np.array(processes.of_all(devices, math.prod(shape))).reshape(shape)
         return cls(
             mesh=Mesh(grid, (SEEDS, MEMBERS)),
-            num_seeds=len(settings.lanes),
+            num_lanes=len(settings.lanes),
             n_models=settings.n_models,
             n_policies=settings.policies_per_model,
             n_members=settings.n_members,
@@ -135,15 +134,15 @@ class Layout:
     def models_of_members(self, models: Any) -> Any:
         """This device's models [N_local, ...] -> for each of its members the model that it learns in [P_local, ...]."""
         chosen = self.model_of(self.member_ids())
-        return jax.tree.map(lambda x: _everywhere(x)[chosen], models)
+        return jax.tree.map(lambda x: _gathered(x)[chosen], models)
 
     def all_models(self, models: Any) -> Any:
         """This device's models [N_local, ...] -> all of them, [N, ...]."""
-        return jax.tree.map(lambda x: _everywhere(x)[: self.n_models], models)
+        return jax.tree.map(lambda x: _gathered(x)[: self.n_models], models)
 
     def all_members(self, values: jax.Array) -> jax.Array:
         """What this device's members have, [P_local, ...] -> what all have, [N·M, ...]."""
-        return _everywhere(values)[:: self.copies][: self.n_members]
+        return _gathered(values)[:: self.copies][: self.n_members]
 
     def all_models_for_members(self, models: Any) -> Any:
         """This device's models [N_local, ...] -> all N of them for each of its members, [P_local, N, ...]."""
@@ -158,7 +157,7 @@ class Layout:
         count = items.shape[0]
         local = -(-count // self.shards)
         ids = jnp.minimum(jax.lax.axis_index(MEMBERS) * local + jnp.arange(local), count - 1)
-        return _everywhere(function(items[ids], ids))[:count]
+        return _gathered(function(items[ids], ids))[:count]
 
     def select_member(self, member: jax.Array, tree: Any, function: Callable = lambda params: params) -> Any:
         """`function` of the leaves [...] that `member` has in `tree` [P_local, ...]: computed by every device for one
@@ -219,7 +218,7 @@ class Layout:
         """`function` of a device's part, jitted over the whole mesh."""
         # Replication along `members` holds by construction (equal inputs, equal programs); jax's static check of it
         # cannot follow MJX's while loops.
-        body = _making_empty_arrays(function)
+        body = empty_arrays.made_inside(function)
         body = jax.shard_map(body, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
         # Shardings are stated, not inferred, so that a fresh and a resumed run are one program to the cache.
         return jax.jit(body, in_shardings=self._placed(in_specs), out_shardings=self._placed(out_specs), **jit)
@@ -248,25 +247,6 @@ class Layout:
         return np.arange(self.padded_members) // self.copies
 
 
-def _making_empty_arrays(function: Callable) -> Callable:
-    """`function`, but it makes the arrays without elements itself that it is given or closes over.
-
-    An MJX model is full of them: there is one for every kind of joint, tendon and contact that it has not. The compiler
-    of jax 0.11 crashes where the body of a `shard_map` reads one that comes from outside (docs/architecture.md).
-    """
-
-    def made_here(x: Any) -> Any:
-        return x if x.size else jnp.zeros_like(x)
-
-    def body(*args: Any) -> Any:
-        args = jax.tree.map(made_here, args)
-        traced, result = jax.make_jaxpr(function, return_shape=True)(*args)
-        traced = ClosedJaxpr(traced.jaxpr, [made_here(x) for x in traced.consts])
-        return jax.tree.unflatten(jax.tree.structure(result), jaxpr_as_fun(traced)(*jax.tree.leaves(args)))
-
-    return body
-
-
 def _mesh_shape(lanes: int, models: int, members: int, most: int, copies: Callable[[int], int]) -> tuple[int, int]:
     """Devices over seeds and over members, up to `most` together: such that the busiest has least to do, and no more of
     them than that takes.
@@ -292,6 +272,6 @@ def _copies(members: int, batch: int, shards: int) -> int:
     return shared if shards == members * shared and batch % shared == 0 and batch // shared >= LEAST_PART else 1
 
 
-def _everywhere(x: jax.Array) -> jax.Array:
+def _gathered(x: jax.Array) -> jax.Array:
     """[X_local, ...] -> [X, ...] on every device."""
     return jax.lax.all_gather(x, MEMBERS, tiled=True)

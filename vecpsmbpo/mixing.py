@@ -76,7 +76,7 @@ def init(settings: PosteriorSettings) -> Bandit:
     return Bandit(excess=nothing, counts=nothing, rounds=jnp.int32(0), lowest=most, highest=-most)
 
 
-def discount(rounds: Whole) -> Float[Array, ""]:
+def kept_share(rounds: Whole) -> Float[Array, ""]:
     """What of earlier rounds is left after one more: 1 - 1 / (8 √rounds).
 
     The order is that of the optimum for few changes (Garivier and Moulines, 2011, who take 1 / 4); rounds so far stand
@@ -94,7 +94,7 @@ def credit(bandit: Bandit, arm: Whole, episode_return: Number) -> Bandit:
     since sums of the returns themselves, thousands each, would leave nothing but rounding where all are equal.
     """
     rounds = bandit.rounds + 1
-    kept = discount(rounds)
+    kept = kept_share(rounds)
     middle, half = (bandit.highest + bandit.lowest) / 2, (bandit.highest - bandit.lowest) / 2 * kept
     lowest, highest = jnp.minimum(middle - half, episode_return), jnp.maximum(middle + half, episode_return)
     excess = bandit.excess + bandit.counts * (bandit.lowest - lowest)

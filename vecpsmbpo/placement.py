@@ -57,7 +57,7 @@ def rings_to_host(layout: Layout, rings: jax.Array) -> list[np.ndarray]:
     others nothing.
     """
     members = [layout.places_of_members.tolist()] if rings.ndim == 4 else []
-    wanted = itertools.product(range(layout.num_seeds), *members)
+    wanted = itertools.product(range(layout.num_lanes), *members)
     if not rings.is_fully_addressable:
         return _from_other_processes(layout, rings, list(wanted))
     by_place: dict[tuple[int, ...], np.ndarray] = {}

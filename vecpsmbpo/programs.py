@@ -32,7 +32,7 @@ def make_driver(settings: Settings) -> Driver:
 
 def make_algorithm(settings: Settings, spec: EnvSpec) -> Algorithm:
     """The algorithm that `algo=` names, on this process's devices."""
-    module, _, name = TABLE[settings.algo].place.partition(":")
+    module, _, name = TABLE[settings.algo].learner.partition(":")
     chosen: type[Algorithm] = getattr(import_module(module), name)
     return chosen(settings, spec, Layout.of(settings))
 

@@ -38,7 +38,7 @@ def working_bytes(algorithm: Algorithm) -> int:
     are put together before they are handed to it when a run is resumed."""
     spec, layout = algorithm.spec, algorithm.layout
     row = 4 * replay.row_size(spec.obs_size, spec.action_size)
-    members = layout.padded_members * layout.num_seeds
+    members = layout.padded_members * layout.num_lanes
     working = members * algorithm.working_bytes(row)
     if not _on_cpu(layout):
         return working

@@ -1,5 +1,6 @@
 """Sets JAX up for a run. Must come before the first array: a backend cannot be changed once it is there."""
 
+import functools
 import logging
 import os
 import re
@@ -24,11 +25,13 @@ def configure(settings: Settings) -> None:
     a GPU.
 
     Raises:
-        SettingError: JAX finds no device, or not the one that JAX_PLATFORMS asks for, or the other processes are not
-            there.
+        SettingError: XLA does not know a flag in XLA_FLAGS, JAX finds no device, or not the one that JAX_PLATFORMS
+            asks for, or the other processes are not there.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     flags = os.environ.get("XLA_FLAGS", "")
+    if others := flags.replace(SINGLE_THREADED, "").strip():
+        _check_flags(others)
     if "xla_cpu_multi_thread_eigen" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {SINGLE_THREADED}".strip()
     if "xla_force_host_platform_device_count" not in flags:
@@ -50,15 +53,9 @@ def configure(settings: Settings) -> None:
         raise SettingError(what) from None
 
 
-def check_flags() -> None:
-    """That XLA knows the flags in XLA_FLAGS, where there are any: it ends the process over one that it does not know.
-
-    Raises:
-        SettingError: it does not.
-    """
-    flags = os.environ.get("XLA_FLAGS", "").strip()
-    if not flags:
-        return
+@functools.cache
+def _check_flags(flags: str) -> None:
+    """That XLA knows the `flags` in XLA_FLAGS: it ends the process over one that it does not know."""
     tried = subprocess.run(
         [sys.executable, "-c", "import jax; jax.devices('cpu')"],
         env={**os.environ, "JAX_PLATFORMS": "cpu"},

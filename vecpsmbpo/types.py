@@ -246,14 +246,14 @@ class Health(struct.PyTreeNode):
     """Where and when something of a lane stopped being finite; the codes are `health`'s. Every leaf [] int32.
 
     Attributes:
-        place: of what first was not finite, from when on the lane is frozen.
+        code: of what first was not finite, from when on the lane is frozen.
         env_steps: at the end of the stride in which that was.
-        seen: place of something not finite that passed by in the running stride and is not part of the state.
+        passing: code of something not finite that passed by in the running stride and is not part of the state.
     """
 
-    place: jax.Array
+    code: jax.Array
     env_steps: jax.Array
-    seen: jax.Array
+    passing: jax.Array
 
 
 class SeedState(struct.PyTreeNode):

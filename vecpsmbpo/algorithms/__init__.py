@@ -17,24 +17,24 @@ class Entry(NamedTuple):
     Attributes:
         title: its name in the literature.
         settings: the class of its settings.
-        place: `module:class` of what learns.
+        learner: `module:class` of what learns.
         format: of its checkpoints; a state that gains or loses fields has another one.
     """
 
     title: str
     settings: type[Settings]
-    place: str
+    learner: str
     format: int
 
 
-_PS_MBPO = Entry("PS-MBPO", PsMbpoSettings, "vecpsmbpo.algorithms.ps_mbpo.algorithm:PsMbpo", format=3)
+_PS_MBPO = Entry("PS-MBPO", PsMbpoSettings, "vecpsmbpo.algorithms.ps_mbpo.algorithm:PsMbpo", format=4)
 
 # In the order of legends and tables, which is the paper's.
 TABLE = {
     "ops_mbpo": _PS_MBPO._replace(title="OPS-MBPO"),
     "ps_mbpo": _PS_MBPO,
     "mbpo": _PS_MBPO._replace(title="MBPO"),
-    "slbo": Entry("SLBO", SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo", format=4),
-    "pets": Entry("PETS", PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=4),
+    "slbo": Entry("SLBO", SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo", format=5),
+    "pets": Entry("PETS", PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=5),
     "sac": _PS_MBPO._replace(title="SAC", settings=RealDataSettings),
 }

@@ -105,13 +105,19 @@ class Algorithm(ABC):
         return None
 
     def draw(
-        self, members: Posterior, values: jax.Array | None, hyper: Hyper, key: jax.Array
+        self, earned: Posterior, values: jax.Array | None, hyper: Hyper, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Who acts in the episode that begins, [] int, and the distribution [N·M] that it was drawn from."""
+        """Who acts in the episode that begins, [] int, and the distribution [N·M] that it was drawn from (line 3).
+
+        Args:
+            earned: by each member.
+            values: of each, [N·M] or None.
+        """
         return jnp.int32(0), jnp.ones(self.settings.n_members)
 
     def credit(self, state: SeedState, episode_return: jax.Array, enabled: jax.Array) -> SeedState:
-        """What the episode that ends earned, [], where `enabled`: added to what is known of the member that acted."""
+        """What the episode that ends earned, [], where `enabled`: added to what is known of the member that acted
+        (line 15)."""
         credited = posterior.credit(state.posterior, state.episode.member, episode_return, enabled)
         return state.replace(posterior=credited)
 
@@ -142,14 +148,14 @@ class Algorithm(ABC):
         """The state before the first step. The first episode is a warm-up episode."""
         settings, spec, layout = self.settings, self.spec, self.layout
         key, model_key, agent_key, draw_key = jax.random.split(key, 4)
-        members = posterior.init(settings.n_members)
+        earned = posterior.init(settings.n_members)
         size = spec.obs_size + spec.action_size
         ring = replay.init(self.ring_capacity, spec.obs_size, spec.action_size)
         rings = jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape))
         return SeedState(
             key=key,
             hyper=hyper,
-            models=jax.vmap(lambda k: dynamics.init(k, hyper, settings, spec))(
+            models=jax.vmap(lambda k: dynamics.init(k, hyper, net=self.model_net, settings=settings, spec=spec))(
                 layout.keys(model_key, layout.model_ids())
             ),
             agents=jax.vmap(self.init_agent)(layout.keys(agent_key, layout.member_ids())),
@@ -157,8 +163,8 @@ class Algorithm(ABC):
             newest=jnp.zeros(ring.shape[1:]),
             imagined=rings if self.ring_capacity else None,
             moments=_no_moments(size, spec.obs_size),
-            posterior=members,
-            episode=self._begin_episode(members, None, hyper, jnp.int32(1), jnp.int32(1), jnp.bool_(True), draw_key),
+            posterior=earned,
+            episode=self._begin_episode(earned, None, hyper, jnp.int32(1), jnp.int32(1), jnp.bool_(True), draw_key),
             memory=self.memory(),
             own=(),
             epoch_return=jnp.zeros(()),
@@ -190,7 +196,8 @@ class Algorithm(ABC):
         truncated: jax.Array,
         key: jax.Array,
     ) -> tuple[SeedState, EpisodeEnd]:
-        """Stores a real transition; where it ends the episode, credits the member and draws the next one.
+        """Stores a real transition (line 7); where it ends the episode, credits the member (line 15) and draws who acts
+        in the next one (lines 1 and 3).
 
         Where something in it is not finite, the episode ends before it, truncated, with the return so far.
         """
@@ -247,7 +254,7 @@ class Algorithm(ABC):
 
     def _begin_episode(
         self,
-        members: Posterior,
+        earned: Posterior,
         values: jax.Array | None,
         hyper: Hyper,
         index: jax.Array,
@@ -255,7 +262,7 @@ class Algorithm(ABC):
         random: jax.Array,
         key: jax.Array,
     ) -> Episode:
-        member, probs = self.draw(members, values, hyper, key)
+        member, probs = self.draw(earned, values, hyper, key)
         after_warmup = jnp.maximum(index - warmups, 1)
         explores = posterior.exploration_probability(hyper.forced_exploration, after_warmup)
         random |= jax.random.bernoulli(jax.random.fold_in(key, 1), explores)
@@ -280,18 +287,19 @@ class Algorithm(ABC):
 
     def fit_models(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Refits every model on D_E (Algorithm 1, line 2) where `enabled`."""
-        settings, spec = self.settings, self.spec
+        settings = self.settings
         split_key, fit_key = jax.random.split(key)
         added = counters.env_steps
         split = dynamics.Split.draw(split_key, added, settings.replay_capacity, settings.validation_block)
-        whitening = dynamics.scaling(state.moments, added, settings)
+        scaling = dynamics.scaling(state.moments, added, settings)
+        how = {"net": self.model_net, "settings": settings, "spec": self.spec}
 
-        def fit(model, key, real, split, whitening, hyper):
-            return dynamics.fit(model, real, split, whitening, hyper, key, settings=settings, spec=spec)
+        def fit(model, key, real, split, scaling, hyper):
+            return dynamics.fit(model, real, split, scaling, hyper, key, **how)
 
         def fitted(models):
             keys = self.layout.keys(fit_key, self.layout.model_ids())
-            return self.layout.map_local(fit, models, keys, shared=(state.real, split, whitening, state.hyper))
+            return self.layout.map_local(fit, models, keys, shared=(state.real, split, scaling, state.hyper))
 
         # Only the models go through the branch: see `schedule.observe_and_learn`.
         return state.replace(models=jax.lax.cond(enabled, fitted, lambda models: models, state.models))

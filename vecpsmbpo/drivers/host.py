@@ -82,7 +82,7 @@ class HostDriver:
         return jax.eval_shape(self._init, keys, hyper, self._shape(self.algorithm.spec.obs_size))
 
     def compile(self, state: TrainState) -> None:
-        spec, seeds, episodes = self.algorithm.spec, self.layout.num_seeds, self.settings.eval_episodes
+        spec, seeds, episodes = self.algorithm.spec, self.layout.num_lanes, self.settings.eval_episodes
         obs, number = self._shape(spec.obs_size), self._shape()
         action, memory, key, keys = jax.eval_shape(self._act, state.counters, state.seeds, obs)
         before, _, learning = jax.eval_shape(self._begin, state)
@@ -149,7 +149,7 @@ class HostDriver:
         return state, end
 
     def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
-        seeds, obs_size = self.layout.num_seeds, self.algorithm.spec.obs_size
+        seeds, obs_size = self.layout.num_lanes, self.algorithm.spec.obs_size
         split = split_for_episodes(keys, episodes)
         env_seed = int(jax.random.randint(split.resets[0, 0], (), 0, 2**30))
         split = self.layout.everywhere(split, BY_SEED)
@@ -194,7 +194,7 @@ class HostDriver:
 
     def _shape(self, *size: int) -> Any:
         """Of float32 numbers [S, *size]."""
-        return jax.ShapeDtypeStruct((self.layout.num_seeds, *size), jnp.float32)
+        return jax.ShapeDtypeStruct((self.layout.num_lanes, *size), jnp.float32)
 
     def _init_local(self, keys: jax.Array, hyper: Hyper, obs: jax.Array) -> TrainState:
         counters = Counters(env_steps=jnp.int32(0), imagined_rows=jnp.int32(0))

@@ -89,14 +89,14 @@ def run(words: Sequence[str]) -> int:
     rows = table(found, options)
     if all(np.isnan(row.cells["final"].value) for row in rows):
         raise SettingError(f"y={options['y']}: is null in every line of the runs up to step {rows[0].env_steps:,}")
-    for text in runs.warnings(found):
-        print(f"vecpsmbpo: warning: {text}", file=sys.stderr)
     if options["out"]:
         writers = {".csv": as_csv, ".md": as_markdown, ".txt": as_text}
         files.write_text(options["out"], writers[options["out"].suffix.lower()](rows, options))
         print(f"written: {options['out']}")
     else:
         print(as_text(rows, options), end="")
+    for text in runs.warnings(found):
+        print(f"vecpsmbpo: warning: {text}", file=sys.stderr)
     return 0
 
 
@@ -286,7 +286,8 @@ def caption(rows: Sequence[Row], options: dict[str, Any]) -> str:
         f"final: mean of the last {options['window']} epochs; best: of all; area: mean of all.",
     ]
     if any("optimality gap" in row.cells for row in rows):
-        parts.append("Optimality gap: of the final score, 1 being the most possible or SAC's after 3M steps (target=).")
+        target = "the most possible, or where nobody knows that SAC's return after 3M steps"
+        parts.append(f"Optimality gap: of the final score, 1 being {target} (target=).")
     if any("P(better)" in row.cells for row in rows):
         parts.append(f"P(better): that a run's final score is above one of {base} (baseline=).")
     if options["threshold"] is not None:

@@ -60,7 +60,9 @@ def run(words: Sequence[str]) -> int:
     out_option = arguments.out(OPTIONS["out"].what, "", *suffixes)
     named, values = arguments.parse("figure", words, OPTIONS | {"out": out_option})
     if not named or named[0] not in DRAW:
-        what = f"{named[0]} is a drawing and is left out" if named and named[0] in DRAWINGS else "takes the name of one"
+        what = "takes the name of one"
+        if named:
+            what = f"{named[0]} is {'a drawing and is left out' if named[0] in DRAWINGS else 'no figure of the paper'}"
         raise SettingError(f"figure: {what}; one of {', '.join(DRAW)}")
     name, *run_dirs = named
     out = values["out"] or (None if name == "table1" else Path(f"{name}.png"))

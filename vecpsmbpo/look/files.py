@@ -67,7 +67,8 @@ def check_writable(path: Path) -> None:
     elif not above.is_dir():
         reason = "Not a directory"
     elif not os.access(above, os.W_OK | os.X_OK):
-        reason = "Permission denied"
+        read_only = hasattr(os, "statvfs") and os.statvfs(above).f_flag & os.ST_RDONLY
+        reason = "Read-only file system" if read_only else "Permission denied"
     else:
         return
     raise SettingError(f"out={path}: cannot be written ({reason})")

@@ -57,6 +57,9 @@ def add(page: "Page", run: Run, heading: str, measured: dict[str, Any] | None) -
     elif (stored := diagnose.read(run)) is not None:
         with diagnose.reading(run):
             _add_diagnosis(page, stored)
+    else:
+        how = escape(f"vecpsmbpo diagnose {shlex.quote(str(run.path))}")
+        page.add(f'<p class="soft">Not measured yet: how accurate models and critics are (<code>{how}</code>).</p>')
     _add_settings(page, run)
 
 

@@ -72,8 +72,7 @@ def train(run: Run, heeding: AbstractContextManager[Stop]) -> Outcome:
     with heeding as stop:
         try:
             limits.check_start()
-            from vecpsmbpo import runtime
-            from vecpsmbpo.training import DiskError, OutOfMemory
+            from vecpsmbpo.training import DiskError, OutOfMemory, TaskFailed
             from vecpsmbpo.training import train as train_here
         except SettingError as error:
             return _failed(2, str(error))
@@ -81,8 +80,9 @@ def train(run: Run, heeding: AbstractContextManager[Stop]) -> Outcome:
             line = words.of_environment(error)
             return _failed(2, line) if line else _failed(1, words.of(error))
         try:
-            runtime.check_flags()
             return Outcome(train_here(run.settings, stop))
+        except TaskFailed as error:
+            return _failed(1, str(error))
         except (SettingError, DiskError, OutOfMemory) as error:
             return _failed(2, str(error))
         except Exception as error:

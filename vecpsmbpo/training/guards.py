@@ -1,4 +1,5 @@
-"""What stands around a run: the lock on its directory, a disk that cannot be written, memory that is not given."""
+"""What stands around a run: the lock on its directory, logs without checkpoints, a disk that cannot be written, memory
+that is not given; and what ends a run that is not a mistake in its settings."""
 
 import contextlib
 import errno
@@ -9,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vecpsmbpo import shortages, words
+from vecpsmbpo import checkpoint, jsonl, metrics, shortages, words
 from vecpsmbpo.settings import SettingError
 
 try:
@@ -26,9 +27,36 @@ class OutOfMemory(Exception):
     """The system gave no more memory; the last checkpoint is whole."""
 
 
+class TaskFailed(Exception):
+    """The task's own code failed; says where, and how to go on from what is saved."""
+
+
+def has_checkpoint(run_dir: Path) -> bool:
+    return any(path.name.isdecimal() for path in (run_dir / checkpoint.FOLDER).glob("*"))
+
+
+def check_not_emptied(run_dir: Path) -> None:
+    """Raises:
+    SettingError: there are logs of a run, and no checkpoints: beginning anew would write over them.
+    """
+    if has_checkpoint(run_dir):
+        return
+    files = (jsonl.METRICS_FILE, jsonl.EPISODES_FILE)
+    done = max((line[jsonl.STEP] for name in files for line in metrics.read(run_dir / name)), default=0)
+    if done:
+        raise SettingError(
+            f"run_dir={run_dir}: its logs reach step {done}, but its checkpoints are gone; put them back, or give "
+            "another run_dir"
+        )
+
+
 @contextlib.contextmanager
 def alone_in(run_dir: Path) -> Iterator[None]:
-    """Keeps a second process from writing into the same run, as long as this one lives; where there are locks."""
+    """Keeps a second process from writing into the same run, as long as this one lives; where there are locks.
+
+    Raises:
+        SettingError: another one does.
+    """
     if fcntl is None:
         yield
         return
@@ -46,7 +74,11 @@ def alone_in(run_dir: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def disk_errors(run_dir: Path) -> Iterator[None]:
-    """Turns a disk that cannot be read or written into one line."""
+    """Turns a disk that cannot be read or written into one line.
+
+    Raises:
+        DiskError: it cannot.
+    """
     hook = sys.unraisablehook
     sys.unraisablehook = partial(_unless_given_up, hook)
     try:
@@ -67,7 +99,11 @@ def _unless_given_up(hook: Callable[[Any], object], unraisable: Any) -> None:
 
 @contextlib.contextmanager
 def memory_errors(run_dir: Path) -> Iterator[None]:
-    """Turns memory that is asked for and not given into one line."""
+    """Turns memory that is asked for and not given into one line.
+
+    Raises:
+        OutOfMemory: it is not given.
+    """
     try:
         yield
     except Exception as error:

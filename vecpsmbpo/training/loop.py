@@ -1,12 +1,10 @@
 """The one loop that does input and output: chunks of the compiled program, and what is kept of them."""
 
 import contextlib
-import shlex
 import time
-from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import numpy as np
 from rich.console import Console
 
@@ -15,7 +13,6 @@ from vecpsmbpo import (
     config,
     crash,
     health,
-    jsonl,
     loggers,
     metrics,
     placement,
@@ -26,14 +23,21 @@ from vecpsmbpo import (
     words,
 )
 from vecpsmbpo.drivers import Driver, Interrupted, Returns
-from vecpsmbpo.envs import speeds
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.look import render, report
 from vecpsmbpo.programs import evaluation_keys, initial_inputs, make_driver
 from vecpsmbpo.progress import Display, Rates, Stopwatch
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.stopping import Stop, heeding_signals
-from vecpsmbpo.training.guards import alone_in, disk_errors, memory_errors
+from vecpsmbpo.training import sayings
+from vecpsmbpo.training.guards import (
+    TaskFailed,
+    alone_in,
+    check_not_emptied,
+    disk_errors,
+    has_checkpoint,
+    memory_errors,
+)
 from vecpsmbpo.types import EpisodeEnd, TrainState
 
 # An epoch that takes longer than this is run in chunks of about half of it, to show progress and to heed signals.
@@ -48,11 +52,12 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
         stop: where whoever heeds the signals writes them down; without it, they are heeded here.
 
     Returns:
-        0, 1 where a lane is frozen (`health`) or a simulator failed, or 128 + the number of the signal that stopped it.
+        0, 1 where a lane is frozen (`health`), or 128 + the number of the signal that stopped it.
 
     Raises:
         SettingError: it cannot be run as asked (`resources.check_memory`, `envs.make`), or not be gone on with. Nothing
             has been changed then.
+        TaskFailed: the task's own code did; what was learned until then is saved.
         DiskError: the run directory cannot be written.
         OutOfMemory: the system gives no more.
         LostProcess: another process of the run is gone.
@@ -61,8 +66,8 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
     try:
         return _train(settings, stop)
     except SimulatorError as error:
-        words.complain(f"{settings.task} failed before its first step: {error}; nothing has been changed")
-        return 1
+        said = f"{settings.task} failed before its first step: {error}; nothing has been changed"
+        raise TaskFailed(said) from error
 
 
 def _train(settings: Settings, stop: Stop | None) -> int:
@@ -73,20 +78,29 @@ def _train(settings: Settings, stop: Stop | None) -> int:
             driver = make_driver(settings)
             shapes = driver.shapes(*initial_inputs(settings))
             memory = resources.check_memory(driver.algorithm, shapes)
-        if not _has_checkpoint(run_dir):
+        if not has_checkpoint(run_dir):
             driver.begin()
         around.enter_context(disk_errors(run_dir))
         with processes.together():
             run_dir.mkdir(parents=True, exist_ok=True)
             if processes.is_first():
                 around.enter_context(alone_in(run_dir))
-            _check_not_emptied(run_dir)
+            check_not_emptied(run_dir)
         stop = around.enter_context(heeding_signals()) if stop is None else stop
         crash.doing(_among("making the first state"), run_dir)
-        with contextlib.ExitStack() as opened:
-            status = _Session(settings, driver, shapes, memory, opened).go(stop)
-        processes.greatest(0)  # whoever left before the first has written its last would take it along
-        return status
+        with _leaving_together(), contextlib.ExitStack() as opened:
+            return _Session(settings, driver, shapes, memory, opened).go(stop)
+
+
+@contextlib.contextmanager
+def _leaving_together() -> Iterator[None]:
+    """Whoever left before the first process has written its last would take it along."""
+    try:
+        yield
+    except TaskFailed:  # in every process
+        processes.greatest(0)
+        raise
+    processes.greatest(0)
 
 
 class _Session:
@@ -142,7 +156,7 @@ class _Session:
             with self.display:
                 self._introduce()
                 if self.env_steps >= settings.total_steps and not self.to_evaluate:
-                    self.display.say(f"already complete at {self.env_steps} steps; raise total_steps to go on")
+                    self.display.say(sayings.complete(self.env_steps))
                     return self._status
                 if self.frozen.all():
                     self.display.say("every lane is frozen: there is nothing to go on with")
@@ -162,9 +176,9 @@ class _Session:
                 self._film()
                 return self._farewell()
         except Interrupted as error:
-            return self._failed(f"at step {error.step}", error)
+            raise self._failed(f"at step {error.step}", error) from error
         except SimulatorError as error:
-            return self._failed(f"in the evaluation at step {self.env_steps}", error)
+            raise self._failed(f"in the evaluation at step {self.env_steps}", error) from error
 
     def _asked_to(self, stop: Stop) -> bool:
         """Whether signals have asked any process to stop; saves first, if it is that which they asked for."""
@@ -179,25 +193,13 @@ class _Session:
         return [device.device_kind for device in self.driver.layout.mesh.devices.flat]
 
     def _introduce(self) -> None:
-        settings, layout = self.settings, self.driver.layout
-        devices = ", ".join(f"{count} × {kind}" for kind, count in Counter(self._devices()).items())
-        self.display.say(f"{versions.line()}; devices: {devices}")
-        swept = "".join(f"{len(values)} values of {name} × " for name, values in settings.sweep)
-        self.display.say(
-            f"{settings.task} ({settings.backend}), {settings.algo}: {settings.num_seeds} seed(s) × {swept}"
-            f"{settings.summary}, on {layout.mesh.size} {jax.default_backend()} device(s)"
-        )
-        if hint := speeds.hint(settings.env, settings.backend, jax.default_backend(), len(settings.lanes)):
-            self.display.say(hint)
-        self.display.say(f"memory: {self.memory}")
-        where = f"resuming at step {self.env_steps}" if self.env_steps else "starting"
-        self.display.say(f"run directory: {self.run_dir} ({where})")
+        for line in sayings.introduction(self.settings, self._devices(), self.memory, self.env_steps):
+            self.display.say(line)
         for lane in np.flatnonzero(self.frozen).tolist():
             self.display.say(self._frozen_words(lane))
 
     def _compile(self) -> None:
-        cached = "; the compilation cache makes this short next time" if self.settings.compile_cache else ""
-        self.display.say(f"compiling the training program{cached} …")
+        self.display.say(sayings.compiling(self.settings))
         crash.doing(_among("compiling the training program"))
         self.driver.compile(self.state)
         crash.doing(_among("training"))
@@ -258,7 +260,8 @@ class _Session:
         lines = [line for line, frozen in zip(self._lines(returns, seconds), self.frozen, strict=True) if not frozen]
         self.log.metrics(lines)
         self.display.epoch(self.env_steps, float(np.mean([line["eval_return"] for line in lines])))
-        self._name_unsound(lines)
+        if unsound := sum(line["unsound_steps"] for line in lines):
+            self.display.say(sayings.unsound(self.settings, unsound, len(lines) * settings.epoch_steps))
         epoch = self.env_steps // settings.epoch_steps
         if epoch % settings.checkpoint_every == 0 and self.env_steps < settings.total_steps:
             self._save()
@@ -323,24 +326,10 @@ class _Session:
         }
 
     def _frozen_words(self, lane: int) -> str:
-        name = ", ".join(f"{name} {value:g}" for name, value in self.settings.lanes[lane].items())
-        step = int(self.health.env_steps[lane])
-        good = step - self.settings.stride
-        what = self._what_froze(lane)
-        return f"{name} is frozen as it was at step {good}: {what} stopped being finite by step {step}"
+        return sayings.frozen(self.settings, lane, int(self.health.env_steps[lane]), self._what_froze(lane))
 
     def _what_froze(self, lane: int) -> str:
         return health.describe(self.state.seeds.replace(health=self.health), lane, self.settings)
-
-    def _name_unsound(self, lines: list[metrics.Line]) -> None:
-        """Names a task whose simulator returned NaN or infinity in the epoch that `lines` are of: also where it was
-        once, since that is a fault, and not so often as to hide anything else."""
-        steps = sum(line["unsound_steps"] for line in lines)
-        if steps:
-            self.display.say(
-                f"{self.settings.task} returned NaN or infinity at {steps} of {len(lines) * self.settings.epoch_steps} "
-                "steps of this epoch; each of them ended its episode, and none is stored"
-            )
 
     @property
     def _status(self) -> int:
@@ -365,50 +354,15 @@ class _Session:
                 resources.check_disk(self.run_dir, self.state, env_steps, self.driver.layout)
 
     def _farewell(self) -> int:
-        self.display.say(f"saved at step {self.env_steps} of {self.settings.total_steps}: {self.run_dir}")
-        if self.frozen.all():
-            self.display.say("stopped: every lane is frozen; what is saved is the last good state of each")
-            return self._status
-        if self.env_steps < self.settings.total_steps:
-            self.display.say(f"to continue: {self._to_continue}")
-            return 128 + self.stopped_by
-        self.display.say(f"to evaluate: vecpsmbpo eval {shlex.quote(f'run_dir={self.run_dir}')} episodes=10")
-        return self._status
+        for line in sayings.farewell(self.settings, self.env_steps, all_frozen=bool(self.frozen.all())):
+            self.display.say(line)
+        ended = self.frozen.all() or self.env_steps >= self.settings.total_steps
+        return self._status if ended else 128 + self.stopped_by
 
-    def _failed(self, where: str, error: Exception) -> int:
-        """Says that the task's own code failed; the exit status."""
-        words.complain(
-            f"{self.settings.task} failed {where}: {error}; saved at step {self.saved_step}; to continue: "
-            f"{self._to_continue}"
-        )
-        return 1
-
-    @property
-    def _to_continue(self) -> str:
-        """The command, as a shell and Hydra read it."""
-        if self.settings.distributed:
-            return "the same command again, in every process"
-        return f"vecpsmbpo train {shlex.quote(config.as_override('run_dir', self.run_dir))}"
+    def _failed(self, where: str, error: Exception) -> TaskFailed:
+        return TaskFailed(sayings.failed(self.settings, where, error, self.saved_step))
 
 
 def _among(doing: str) -> str:
     """With the other processes of the run, if there are any: a crash may be theirs."""
     return doing + (crash.BESIDE_OTHERS if processes.are_several() else "")
-
-
-def _has_checkpoint(run_dir: Path) -> bool:
-    return any(path.name.isdecimal() for path in (run_dir / checkpoint.FOLDER).glob("*"))
-
-
-def _check_not_emptied(run_dir: Path) -> None:
-    """Raises:
-    SettingError: there are logs of a run, and no checkpoints: beginning anew would write over them.
-    """
-    if not _has_checkpoint(run_dir):
-        files = (jsonl.METRICS_FILE, jsonl.EPISODES_FILE)
-        done = max((line[jsonl.STEP] for name in files for line in metrics.read(run_dir / name)), default=0)
-        if done:
-            raise SettingError(
-                f"run_dir={run_dir}: its logs reach step {done}, but its checkpoints are gone; put them back, or give "
-                "another run_dir"
-            )

@@ -46,7 +46,7 @@ class PsMbpo(Algorithm):
 
     @property
     def ring_capacity(self) -> int:
-        return imagination.ring_capacity(self.settings)
+        return imagination.ring_capacity(self.settings) if self.settings.imagines else 0
 
     def retained_rows(self, env_steps: Whole) -> jax.Array:
         return imagination.retained_rows(self.settings, env_steps)
@@ -55,6 +55,8 @@ class PsMbpo(Algorithm):
         """Minibatches of a step, or rows in flight of a rollout."""
         settings = self.settings
         minibatches = 3 * settings.updates_per_step * settings.policy_batch_size * row
+        if not settings.imagines:
+            return minibatches
         return max(minibatches, imagination.batch_size(settings) * (2 * row + 8 * settings.model_hidden_size))
 
     def init(self, key: jax.Array, hyper: Hyper) -> SeedState:
@@ -77,10 +79,10 @@ class PsMbpo(Algorithm):
     # ── who acts: once an episode ────────────────────────────────────────────────────────────────────────────
 
     def draw(
-        self, members: Posterior, values: jax.Array | None, hyper: Hyper, key: jax.Array
+        self, earned: Posterior, values: jax.Array | None, hyper: Hyper, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """A member by equation 18 or 19; with `posterior=average` none, -1."""
-        member, probs = posterior.draw(posterior.logits(members, values, hyper.temperature), key)
+        member, probs = posterior.draw(posterior.logits(earned, values, hyper.temperature), key)
         return jnp.int32(-1) if self.settings.averages_members else member, probs
 
     def credit(self, state: SeedState, episode_return: jax.Array, enabled: jax.Array) -> SeedState:
@@ -192,7 +194,7 @@ class PsMbpo(Algorithm):
         """Whether any member may learn from imagined data, [] bool, in the period that begins: λ may fall from 1 within
         it, and what is then drawn from must be there. Who learns from real data alone (λ = 1, equation 15) needs no
         models."""
-        if self.settings.adapts_real_ratio:
+        if self.settings.adapts_real_ratio or not self.settings.imagines:
             return jnp.bool_(self.settings.imagines)  # any member may move to any λ
         last = counters._replace(env_steps=counters.env_steps + self.settings.model_update_every)
         return jnp.any(self.real_ratios(last, state) < 1)
@@ -201,6 +203,8 @@ class PsMbpo(Algorithm):
         self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
     ) -> tuple[Counters, SeedState]:
         """Refits the models and renews the imagined data (Algorithm 1, lines 2 and 8 to 10)."""
+        if not self.settings.imagines:
+            return counters, state
         fit_key, imagine_key = jax.random.split(key)
         state = self.fit_models(counters, state, enabled, fit_key)
         return self.imagine(counters, state, enabled, imagine_key)
@@ -293,12 +297,18 @@ class PsMbpo(Algorithm):
         return updates, int(np.sum(rows)) * settings.n_members
 
     def minibatches(
-        self, counters: Counters, state: SeedState, imagined: jax.Array, real_ratio: jax.Array, key: jax.Array
+        self, counters: Counters, state: SeedState, imagined: jax.Array | None, real_ratio: jax.Array, key: jax.Array
     ) -> Transition:
-        """G minibatches, each row real with probability λ, on its own (footnote 2). imagined: [C_M, F], λ []."""
+        """G minibatches, each row real with probability λ [], on its own (footnote 2).
+
+        Args:
+            imagined: [C_M, F], the member's ring; or None, where nobody learns from imagined data.
+        """
         shape = (self.settings.updates_per_step, self.settings.policy_batch_size)
         source_key, real_key, imagined_key = jax.random.split(key, 3)
         real_index = replay.sample_indices(real_key, shape, counters.env_steps, state.real.shape[0])
+        if imagined is None:
+            return self._unpack(state.real[real_index])
         newest = self.retained_rows(counters.env_steps)
         imagined_index = replay.sample_newest_indices(
             imagined_key, shape, counters.imagined_rows, imagined.shape[0], newest

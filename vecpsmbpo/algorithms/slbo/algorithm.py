@@ -60,10 +60,10 @@ class Slbo(Algorithm):
     ) -> tuple[Counters, SeedState]:
         """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""
         layout = self.layout
-        whitening = dynamics.scaling(state.moments, counters.env_steps, self.settings)
+        scaling = dynamics.scaling(state.moments, counters.env_steps, self.settings)
         fit = partial(multistep.fit, net=self.model_net, settings=self.settings, spec=self.spec)
 
-        def learn(model, agent, key, counters, real, whitening, hyper):
+        def learn(model, agent, key, counters, real, scaling, hyper):
             added = counters.env_steps
 
             def round_(learned, key):
@@ -80,12 +80,12 @@ class Slbo(Algorithm):
                 agent, _ = jax.lax.scan(policy_step, agent, jax.random.split(policy_key, self.settings.policy_steps))
                 return (model, agent), None
 
-            model = model.replace(scaling=whitening)
+            model = model.replace(scaling=scaling)
             return jax.lax.scan(round_, (model, agent), jax.random.split(key, self.settings.rounds))[0]
 
         def learned(models, agents):
             keys = layout.keys(key, layout.member_ids())
-            shared = counters, state.real, whitening, state.hyper
+            shared = counters, state.real, scaling, state.hyper
             return layout.map_local(learn, models, agents, keys, shared=shared)
 
         models, agents = jax.lax.cond(enabled, learned, lambda *same: same, state.models, state.agents)
