@@ -27,10 +27,12 @@ class Option(NamedTuple):
 
 
 def text(what: str, default: str = "", allowed: str = "a name") -> Option:
+    """One word."""
     return Option(what, default, _filled, allowed)
 
 
 def names(what: str, *default: str, allowed: str = "names, separated by commas") -> Option:
+    """Some words: `a,b`."""
     return Option(what, default, lambda value: tuple(_filled(part) for part in value.split(",")), allowed)
 
 
@@ -45,6 +47,8 @@ def choice(what: str, *options: str, default: str | None = None) -> Option:
 
 
 def whole(what: str, default: int, at_least: int = 0, at_most: int | None = None) -> Option:
+    """A whole number in a range."""
+
     def read(value: str) -> int:
         # isdecimal before int: int() also takes 1_0, " 1" and other spellings.
         if not (value.isascii() and value.isdecimal() and int(value) >= at_least):
@@ -69,6 +73,8 @@ def wholes(what: str) -> Option:
 
 
 def number(what: str, default: float | None = None, above: float = -float("inf")) -> Option:
+    """A finite number above another."""
+
     def read(value: str) -> float:
         found = float(value)
         if not above < found < float("inf"):

@@ -38,7 +38,7 @@ vecpsmbpo: posterior-sampling model-based policy optimization, vectorized in JAX
 settings: {settings}
 
 What each setting does stands beside its default in {config};
-of those that PETS or SLBO alone has, in algo/settings beside it.
+of those that one algorithm alone has, in algo/settings beside it.
 """
 
 

@@ -26,6 +26,7 @@ def batch_size(settings: ImaginationSettings) -> int:
 
 
 def longest_horizon(settings: ImaginationSettings) -> int:
+    """Steps of a rollout, at most, in the whole run."""
     return max(settings.horizon_first, settings.horizon_last)
 
 

@@ -10,6 +10,7 @@ STARTS = 32  # K, episodes whose first observations members are asked about
 
 
 def init(members: int) -> Posterior:
+    """Nobody has earned anything."""
     return Posterior(jnp.zeros(members), jnp.zeros(members), jnp.zeros(members, jnp.int32))
 
 

@@ -64,6 +64,7 @@ class RewardRange(NamedTuple):
 
 
 def make_networks(settings: SacSettings, spec: EnvSpec) -> Networks:
+    """Of every member: obs [..., O] -> a distribution over actions [..., A], and Q_1, Q_2 [...] of the two."""
     size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
     most = networks.LOG_PROB_BOUND if settings.bound_log_prob else float("inf")
     precision = settings.network_precision
@@ -74,6 +75,7 @@ def make_networks(settings: SacSettings, spec: EnvSpec) -> Networks:
 
 
 def init(key: PRNGKeyArray, nets: Networks, spec: EnvSpec) -> Agent:
+    """A member drawn at random, with target critics equal to the critics and α = 1."""
     actor_key, critic_key = jax.random.split(key)
     obs, action = jnp.zeros(spec.obs_size), jnp.zeros(spec.action_size)
     actor, critic = nets.actor.init(actor_key, obs), nets.critic.init(critic_key, obs, action)

@@ -61,7 +61,14 @@ def for_hydra(overrides: Iterable[str]) -> list[str]:
 
 
 def from_tree(tree: DictConfig, overrides: Sequence[str]) -> Settings:
-    """Settings from what Hydra composed, with the backend and the run directory resolved."""
+    """Settings from what Hydra composed, with the backend and the run directory resolved.
+
+    Args:
+        overrides: `name=value`, as given, for what is said of a mistake.
+
+    Raises:
+        SettingError: a value that is missing, of another type or out of range, or settings that contradict one another.
+    """
     with hydra_errors():
         values: Any = OmegaConf.to_container(tree, resolve=True)
     values["sweep"] = values["sweep"] or {}

@@ -80,7 +80,11 @@ def _check_env_options(found: dict[str, Any]) -> None:
 
 
 def check_env_values(env: str, given: Mapping[str, Any]) -> None:
-    """That the options of a task have the types of their defaults; one that must be given is a name."""
+    """That the options of a task have the types of their defaults; one that must be given is a name.
+
+    Raises:
+        SettingError: one has another.
+    """
     for name, usual in env_options(env).items():
         value = given.get(name, usual)
         if isinstance(usual, str):
@@ -111,7 +115,11 @@ def _sweep_values(override: Override) -> list[Any]:
 
 
 def check_override(name: str, value: Any) -> Any:
-    """`value` as the type of what `name` says, a setting or a group."""
+    """`value` as the type of what `name` says, a setting or a group.
+
+    Raises:
+        SettingError: there is no such setting, group or choice of it, or the value is of another type.
+    """
     if name in (*GROUPS, "experiment"):
         if value not in options(name):
             raise SettingError(f"{name}={value}: {closest(str(value), options(name))}")

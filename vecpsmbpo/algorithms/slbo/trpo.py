@@ -63,11 +63,13 @@ class Networks(NamedTuple):
 
 
 def make_networks(settings: SlboSettings, spec: EnvSpec) -> Networks:
+    """Whitened obs [..., O] -> a Gaussian over actions [..., A], and a value [...]."""
     size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
     return Networks(networks.GaussianPolicy(spec.action_size, size, layers), networks.StateValue(size, layers))
 
 
 def init(key: PRNGKeyArray, nets: Networks, spec: EnvSpec) -> TrpoAgent:
+    """A policy and its value function, drawn at random."""
     policy_key, value_key = jax.random.split(key)
     obs = jnp.zeros(spec.obs_size)
     value = nets.value.init(value_key, obs)
