@@ -32,8 +32,8 @@ class Trained:
         step: environment steps when it was written.
         index: of the lane.
         state: of all lanes, leaves [S, ...].
-        imagined_rows: that every ring has received (`replay.wrapped`: of very many, a smaller number with the same place
-            in the ring).
+        imagined_rows: that every ring has received (`replay.wrapped`: of very many a smaller number, with the same
+            place in the ring).
     """
 
     run: Run
