@@ -9,10 +9,9 @@ import pytest
 
 from vecpsmbpo import config, networks, sac
 from vecpsmbpo.envs import registry, specs
-from vecpsmbpo.schedule import over_seeds
-from vecpsmbpo.types import Counters, Hyper, Transition
+from vecpsmbpo.types import Hyper, Transition
 
-from .helpers import algorithm, initial, tiny
+from .helpers import tiny
 
 OFF = {
     "whiten_targets": False,
@@ -20,7 +19,6 @@ OFF = {
     "clip_targets": False,
     "bound_log_prob": False,
     "target_update_every": 1,
-    "policy_learning_rate_decay": 1.0,
 }
 
 
@@ -117,26 +115,3 @@ def test_the_target_critic_moves_at_every_fourth_update(key):
         same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), before.target_critic, agent.target_critic)
         moved.append(not all(jax.tree.leaves(same)))
     assert moved == [False, False, False, True] * 2
-
-
-def test_the_learning_rate_falls_on_a_line_and_stays():
-    settings = tiny(policy_learning_rate_decay=0.1, policy_learning_rate_decay_steps=100)
-    rates = [float(sac.learning_rate(settings, 1e-3, steps)) for steps in (0, 50, 100, 1000)]
-    assert rates == pytest.approx([1e-3, 5.5e-4, 1e-4, 1e-4], rel=1e-5)
-    assert sac.learning_rate(tiny(), 1e-3, 50) == 1e-3
-
-
-def test_policies_learn_with_the_rate_of_the_step(key):
-    """Adam's first step is as long as its rate, whatever the gradient."""
-    changes = {"policy_learning_rate_decay": 0.1, "policy_learning_rate_decay_steps": 50}
-    learner = algorithm(tiny(n_models=1, n_policies=1, updates_per_step=1, **changes), specs.get("hopper"))
-    states, layout = initial(learner), learner.layout
-    learn = over_seeds(lambda counters, state: learner.learn(counters, state, state.key))
-    program = layout.jit_shard_map(learn, (layout.specs().counters, layout.specs().seeds), layout.specs().seeds.agents)
-
-    def length(steps):
-        agents = program(Counters(jnp.int32(steps), jnp.int32(16)), states)
-        before, after = (jax.tree.leaves(agent.actor) for agent in (states.agents, agents))
-        return max(float(jnp.max(jnp.abs(a - b))) for a, b in zip(before, after, strict=True))
-
-    assert length(50) == pytest.approx(0.1 * length(0), rel=1e-3)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from vecpsmbpo import networks, optim
 from vecpsmbpo.settings.parts import SacSettings
-from vecpsmbpo.types import EnvSpec, Hyper, Number, Params, Stats, Transition, Whole
+from vecpsmbpo.types import EnvSpec, Hyper, Number, Params, Stats, Transition
 
 
 class SacStats(Stats):
@@ -90,18 +90,6 @@ def init(key: PRNGKeyArray, nets: Networks, spec: EnvSpec) -> Agent:
         alpha_optimizer=optim.init(log_alpha),
         stats=SacStats.zero(),
     )
-
-
-def learning_rate(settings: SacSettings, first: Number, env_steps: Whole) -> Number:
-    """What Adam steps with after `env_steps`: on a line from `first` to a share of it, `policy_learning_rate_decay`.
-
-    Large steps find a policy, and small ones tell apart actions whose values differ by less than the noise that large
-    steps leave in the critics. The line's end is a setting of its own, so that a run can be prolonged.
-    """
-    if settings.policy_learning_rate_decay == 1:
-        return first
-    progress = jnp.minimum(env_steps / settings.policy_learning_rate_decay_steps, 1.0)
-    return first * (1 - (1 - settings.policy_learning_rate_decay) * progress)
 
 
 def target_value(

@@ -279,14 +279,12 @@ class PsMbpo(Algorithm):
         batches, noise = layout.part((batches, noise), axis=2)
 
         reward_range = _reward_range(state) if settings.clip_targets else None
-        rate = sac.learning_rate(settings, state.hyper.policy_learning_rate, counters.env_steps)
-        hyper = state.hyper.replace(policy_learning_rate=rate)
 
         def update(agent, batches, noise, hyper, reward_range):
             how = {"target_every": settings.target_update_every, "mean": layout.mean_of_parts}
             return sac.updates(agent, batches, noise, hyper, nets=nets, reward_range=reward_range, **how)
 
-        return layout.map_local(update, state.agents, batches, noise, shared=(hyper, reward_range))
+        return layout.map_local(update, state.agents, batches, noise, shared=(state.hyper, reward_range))
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings
