@@ -69,7 +69,7 @@ PARTS = (
         "parity",
         2,
         ("parity.py", "hopper", "states=500", "episodes=5"),
-        ("parity.py", "cartpole_swingup", "states=50", "episodes=1"),
+        ("parity.py", "cartpole_swingup", "states=50", "episodes=2"),
     ),
     Part("ant_stable", 9, ("env=ant", "backend=host", "total_steps=40000", "seed=0", "recipe=stable"), trains=True),
 )
