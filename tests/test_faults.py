@@ -1,34 +1,24 @@
-"""What careless commands, surroundings and tasks do: one line each. In this process, where nothing has to start."""
+"""What careless commands and surroundings do: one line each. In this process, where nothing has to start."""
 
 import contextlib
-import errno
 import importlib.util
 import io
 import os
 import re
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
 
-import gymnasium
 import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
-from brax.envs.base import Env, State
 from rich.console import Console
 
 from tests.helpers import command, environment, tiny
-from tools import faults
-from tools.harm import writes
-from vecpsmbpo import cli, config, envs, runtime, stopping, words
+from vecpsmbpo import cli, config, runtime, stopping, words
 from vecpsmbpo.envs import registry
-from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.sweeps import launch
-from vecpsmbpo.types import EnvSpec
 
 SUITE = ["env=gymnasium", "backend=host"]
 CARELESS = [
@@ -82,117 +72,6 @@ def test_a_default_run_directory_of_many_overrides_has_a_name_that_fits():
     assert all(len(name) < 255 for name in names)
 
 
-TASKS = {
-    "number = 5": ":number",
-    "class Wants:\n    def __init__(self, x): pass": ":Wants",
-    "def fails(): raise KeyError('no')": ":fails",
-    "def leaves(): raise SystemExit(0)": ":leaves",
-    "class Odd(BaseException): pass\ndef raises(): raise Odd('no')": ":raises",
-    "import nowhere_at_all": ":X",
-    "raise RuntimeError('at import')": ":X",
-    "def (": ":X",
-    "raise SystemExit(0)": ":X",
-    "import os": ":os",
-    "X = None": "",
-    "Y = None": ":X",
-    "from gymnasium import Env as X": ":X",
-}
-
-
-@pytest.mark.parametrize("backend", ["host", "mjx"])
-def test_a_task_that_cannot_be_made_is_one_line(backend, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for index, (code, attribute) in enumerate(TASKS.items()):
-        make = f"careless_{backend}_{index}{attribute}"
-        (tmp_path / f"careless_{backend}_{index}.py").write_text(code)
-        with pytest.raises(SettingError, match=r"env\.make=careless") as error:
-            envs.make("custom", backend, make=make)
-        assert "\n" not in str(error.value)
-
-
-class Nothing(gymnasium.Env):
-    """A task in which there is nothing to see, or with `Idle` nothing to do."""
-
-    observation_space = gymnasium.spaces.Box(-1, 1, (0,))
-    action_space = gymnasium.spaces.Box(-1, 1, (2,))
-
-
-class Idle(Nothing):
-    observation_space, action_space = Nothing.action_space, Nothing.observation_space
-
-
-@pytest.mark.parametrize(("kind", "sizes"), [("Nothing", r"0 obs.* and 2 act"), ("Idle", r"2 obs.* and 0 act")])
-def test_a_task_has_something_to_see_and_to_do(kind, sizes):
-    with pytest.raises(SettingError, match=rf"env\.make=\S+: has {sizes}.*at least one of each"):
-        envs.make("custom", "host", make=f"{__name__}:{kind}")
-
-
-class Elsewhere(Nothing):
-    observation_space = Nothing.action_space
-
-    def __init__(self):
-        os.chdir("/")
-
-
-def test_a_task_that_leaves_the_working_directory_does_not_take_the_run_along(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    envs.make("custom", "host", make=f"{__name__}:Elsewhere")
-    assert os.getcwd() == str(tmp_path)
-
-
-RULES = {
-    "one answer for all": (lambda obs, action, next_obs: jnp.all(next_obs > 5), r"gives bool\[\] for 7 transitions"),
-    "the first transition": (lambda obs, action, next_obs: next_obs[0] > 5, r"gives bool\[2\] for 7 transitions"),
-    "a number": (lambda obs, action, next_obs: next_obs[:, 0], r"gives float32\[7\] for 7 transitions, not bool\[7\]"),
-    "nothing": (lambda obs, action, next_obs: None, "gives nothing for 7 transitions"),
-    "of the object": (lambda self, obs, action, next_obs: obs[..., 0] > 0, "missing 1 required positional argument"),
-}
-
-
-@pytest.mark.parametrize(("rule", "line"), RULES.values(), ids=RULES)
-def test_a_termination_rule_answers_for_each_of_a_batch(rule, line, monkeypatch):
-    monkeypatch.setattr(Idle, "action_space", Idle.observation_space)
-    monkeypatch.setattr(Idle, "termination_rule", rule, raising=False)
-    with pytest.raises(SettingError, match=line):
-        envs.make("custom", "host", make=f"{__name__}:Idle")
-    monkeypatch.setattr(Idle, "termination_rule", lambda obs, action, next_obs: next_obs[..., 0] > 5)
-    assert envs.make("custom", "host", make=f"{__name__}:Idle").spec.obs_size == 2
-
-
-class Stays(Env):
-    """An environment of two numbers in which nothing happens."""
-
-    spec = EnvSpec("stays", 2, 1, 10, None)
-    observation_size, action_size, backend = 2, 1, "none"
-
-    def reset(self, rng):
-        return State(None, jnp.zeros(2), jnp.zeros(()), jnp.zeros(()))
-
-    def step(self, state, action):
-        return self.change(state)
-
-
-WRONG_STATES = {
-    "another observation": (lambda state: state.replace(obs=jnp.zeros(3)), r"its step gives obs of shape \(3,\), not"),
-    "a vector of rewards": (lambda state: state.replace(reward=jnp.zeros(1)), r"reward of shape \(1,\), not \(\)"),
-    "a number": (lambda state: 5, "its step gives an array, not a brax.envs.base.State"),
-    "other parts": (lambda state: state.replace(info={"x": 1}), "its step gives a State of other parts"),
-    "another type": (
-        lambda state: state.replace(done=state.done > 0),
-        "gives State.done as bool.*its reset as float32",
-    ),
-}
-
-
-@pytest.mark.parametrize(("change", "line"), WRONG_STATES.values(), ids=WRONG_STATES)
-def test_a_state_that_a_task_cannot_give_is_one_line(change, line, monkeypatch):
-    monkeypatch.setattr(Stays, "change", lambda self, state: change(state), raising=False)
-    with pytest.raises(SettingError, match=rf"^env\.make=\S+: .*{line}"):
-        envs.make("custom", "mjx", make=f"{__name__}:Stays")
-    monkeypatch.setattr(Stays, "change", lambda self, state: state)
-    assert envs.make("custom", "mjx", make=f"{__name__}:Stays").spec.obs_size == 2
-
-
 @pytest.mark.parametrize("launcher", ["ray", "'ray'", "[ray]"])
 def test_a_launcher_that_is_not_installed_is_one_line(launcher, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
@@ -210,44 +89,6 @@ def test_an_exception_in_one_line_says_where_it_was_raised():
     with pytest.raises(KeyError) as found:
         {}["x"]
     assert re.fullmatch(rf"KeyError: 'x' at {__file__}:\d+", words.of(found.value))
-
-
-class Simulator:
-    """Gives what it was made with."""
-
-    def __init__(self, *results):
-        self._results = iter(results)
-
-    def reset(self):
-        return np.zeros(2)
-
-    def step(self, action):
-        result = next(self._results)
-        if isinstance(result, BaseException):
-            raise result
-        return result
-
-
-@pytest.mark.parametrize(
-    ("result", "line"),
-    [
-        (ValueError("the motor is hot"), "ValueError: the motor is hot at "),
-        (SystemExit(0), "SystemExit: 0 at "),
-        ((np.zeros(3), 0.0, False, False), r"an observation has shape \(3,\), not \(2,\)"),
-        ((np.zeros((1, 2)), 0.0, False, False), r"an observation has shape \(1, 2\), not"),
-        ((None, 0.0, False, False), "an observation has shape|TypeError"),
-        ((np.zeros(2), [1.0, 2.0], False, False), "ValueError|TypeError"),
-        ((np.zeros(2), 0.0, False), "ValueError"),
-    ],
-)
-def test_what_a_simulator_cannot_give_is_one_line(result, line):
-    fine = (np.zeros(2), 0.0, False, False)
-    env = HostEnv(EnvSpec("mine", 2, 1, 10, None), [Simulator(fine, fine), Simulator(fine, result)])
-    env.reset()
-    env.step(np.zeros((2, 1)))
-    with pytest.raises(SimulatorError, match=line) as error:
-        env.step(np.zeros((2, 1)))
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("error", [RuntimeError("Unable to initialize backend"), AssertionError()])
@@ -299,17 +140,17 @@ def test_a_value_that_xla_cannot_read_is_one_line(monkeypatch):
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 1, stderr=said))
     monkeypatch.setenv("XLA_FLAGS", "--xla_foo=x")
     with pytest.raises(SettingError, match=r"^XLA_FLAGS=--xla_foo=x: Couldn't interpret value x\.$"):
-        runtime.check_flags()
+        runtime.configure(tiny())
 
 
 def test_a_flag_that_xla_does_not_know_is_one_line(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(subprocess, "run", pytest.fail)
-    runtime.check_flags()  # costs nothing where there are none
+    runtime.configure(tiny())  # costs nothing where there are none
     monkeypatch.undo()
     monkeypatch.setenv("XLA_FLAGS", "--xla_foo=1")
     with pytest.raises(SettingError, match="XLA_FLAGS=--xla_foo=1: Unknown flag in XLA_FLAGS: --xla_foo=1"):
-        runtime.check_flags()
+        runtime.configure(tiny())
 
 
 @pytest.mark.parametrize("name", ["runs/x", "a=b", "5", "a b", "λ, τ", "it's", "null", "[1]", "$HOME", "a\\", "{x}"])
@@ -395,77 +236,3 @@ def test_a_reader_that_is_gone_does_not_stop_what_is_printed_to_it(monkeypatch):
         assert unheard
         with contextlib.suppress(BrokenPipeError):  # what is left in its buffer
             pipe.close()
-
-
-WRITING = """
-import os, sys
-for act in (
-    lambda: os.mkdir("below/a"),
-    lambda: open("below/a/b", "wb", buffering=0).write(b"x"),
-    lambda: os.fsync(os.open("below/a/b", os.O_WRONLY)),
-    lambda: os.rename("below/a/b", "below/a/c"),
-    lambda: open("below/a/c").read() + open("beside", "w").name,
-):
-    try:
-        act()
-    except OSError as error:
-        print(error.errno)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux" or shutil.which("gcc") is None, reason="needs gcc and LD_PRELOAD")
-def test_one_write_below_a_directory_can_be_made_to_fail(tmp_path):
-    """What tools/faults makes of writes.c."""
-    shim = tmp_path / "writes.so"
-    subprocess.run(["gcc", "-shared", "-fPIC", "-o", shim, writes.SHIM, "-ldl"], check=True)
-    told = {"LD_PRELOAD": str(shim), "WRITES_BELOW": str(tmp_path / "below"), "WRITES_LOG": str(tmp_path / "log")}
-    seen = ["mkdir a", "open a/b", "write a/b", "open a/b", "sync a/b", "rename a/c"]
-    for number in range(len(seen) + 1):
-        shutil.rmtree(tmp_path / "below", ignore_errors=True)
-        (tmp_path / "below").mkdir()
-        (tmp_path / "log").unlink(missing_ok=True)
-        surroundings = {**environment(), **told, "WRITES_FAIL": str(number), "WRITES_ERROR": str(errno.EIO)}
-        program = [os.path.realpath(sys.executable), "-c", WRITING]
-        result = subprocess.run(program, cwd=tmp_path, env=surroundings, capture_output=True, text=True, check=True)
-        errors = result.stdout.split()
-        assert errors[:1] == ([str(errno.EIO)] if number else [])
-        lines = (tmp_path / "log").read_text().splitlines()
-        assert lines[:number] == seen[:number]
-        assert number or lines == seen
-
-
-def test_each_kind_of_write_is_tried():
-    array = "checkpoints/120.orbax-checkpoint-tmp/state.orbax-checkpoint-tmp/real.0"
-    kinds = [writes._kind_of_write(f"write {array}/{name}") for name in ("0.0", "0.0.__lock", "1.0", ".zarray")]
-    assert kinds == [f"write checkpoints/state/array/{name}" for name in ("part", "part__lock", "part", ".zarray")]
-    assert writes._kind_of_write("open .config.4711.yaml") == "open .config.#.yaml"
-    full, broken = errno.ENOSPC, errno.EIO
-    assert writes._chosen(["a", "b", *"aaaa"], more=2) == [
-        (1, "a, first of 5", full),
-        (2, "b, first of 1", broken),
-        (4, "a, middle of 5", full),
-        (6, "a, last of 5", broken),
-        (5, "what is written 75.8% of the way", full),
-        (2, "b, first of 1", full),  # b has met a full disk, too
-    ]
-
-
-def test_the_table_of_faults_has_what_is_tried_and_no_more(tmp_path, monkeypatch):
-    monkeypatch.setattr(faults, "OUT", tmp_path / "faults.csv")
-    row = {"ended": "same end", "commit": "a", "versions": "b"}
-    faults.keep("files", ["of old", "first"], {"what": "of old", **row})
-    faults.keep("twice", ["other"], {"what": "other", **row})
-    for what, ended in (("second", "same end"), ("first", "another end"), ("first", "same end")):
-        faults.keep("files", ["first", "second"], {**row, "what": what, "ended": ended})
-    lines = ["part,what,ended,commit,versions", *(f"{name},same end,a,b" for name in ("files,first", "files,second"))]
-    assert faults.OUT.read_text().splitlines() == [*lines, "twice,other,same end,a,b"]
-
-
-def test_what_a_machine_has_not_for_a_part_of_tools_faults_is_said(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(faults, "OUT", tmp_path / "faults.csv")
-    monkeypatch.setenv("PATH", str(tmp_path))  # no gcc, no mount, no git
-    assert faults.main(["part=writes,disk"]) == 1
-    writing, mounting = capsys.readouterr().out.splitlines()
-    assert writing.startswith("writes: not tried: needs gcc")
-    assert mounting.startswith("disk: not tried: disks cannot be mounted here (")
-    assert not faults.OUT.exists()
