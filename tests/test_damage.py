@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import types
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from vecpsmbpo.drivers.host import HostDriver
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.envs.host.dm_control import DmControlSimulator
 from vecpsmbpo.settings import SettingError
+from vecpsmbpo.stopping import Stop
 from vecpsmbpo.training import guards
 from vecpsmbpo.training.loop import _Session
 from vecpsmbpo.types import Hyper
@@ -254,6 +256,27 @@ def test_a_simulator_that_fails_in_an_evaluation_costs_no_training(failing, shor
         monkeypatch.undo()
     assert training.train(settings) == 0
     assert capsys.readouterr().err == ""
+    assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
+
+
+@pytest.mark.parametrize("stopped_at", [40, 120])
+def test_a_signal_in_an_evaluation_is_heeded(stopped_at, short_run, tmp_path, monkeypatch, capsys):
+    """Nothing of what was trained is lost, and the evaluation is made up for; also the last one."""
+    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"), checkpoint_every=5)
+    evaluated, stop = HostDriver.evaluate, Stop()
+
+    def signalled(driver, state, *args):
+        if int(state.counters.env_steps) == stopped_at:
+            stop.requested = signal.SIGTERM
+        return evaluated(driver, state, *args)
+
+    monkeypatch.setattr(HostDriver, "evaluate", signalled)
+    assert training.train(settings, stop) == 128 + signal.SIGTERM
+    assert "to continue: vecpsmbpo train" in capsys.readouterr().out
+    assert evaluate.restore(settings)[1].step == stopped_at
+    assert all(line["env_steps"] < stopped_at for line in jsonl.read(tmp_path / "run" / "metrics.jsonl"))
+    monkeypatch.undo()
+    assert training.train(settings) == 0
     assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
 
 

@@ -12,7 +12,7 @@ from tests import probes
 from tests.helpers import algorithm, assert_probabilities_follow, tiny
 from vecpsmbpo import metrics, placement, replay, sac
 from vecpsmbpo.algorithms.catalogue import of_algorithm
-from vecpsmbpo.drivers import HostDriver, ScanDriver
+from vecpsmbpo.drivers import HostDriver, ScanDriver, Stopped
 from vecpsmbpo.drivers.common import split_for_episodes
 from vecpsmbpo.programs import evaluation_keys, initial_inputs
 
@@ -135,6 +135,12 @@ def test_evaluation_plays_whole_episodes_of_the_mean_action(trained):
     assert returns.episode_return.shape == (1, 3)
     assert (returns.length == (2 if terminates else EVALUATED)).all()
     assert (returns.episode_return > (0.85 if terminates else 1.7)).all()  # one and two steps are rewarded
+
+
+def test_an_evaluation_can_be_stopped(trained):
+    settings, driver, _, state, _ = trained
+    with pytest.raises(Stopped):
+        driver.evaluate(state, evaluation_keys(settings, STEPS), 3, lambda: True)
 
 
 def test_inputs_are_whitened_by_all_the_data(trained):

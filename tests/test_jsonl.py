@@ -62,10 +62,11 @@ def test_what_a_checkpoint_knows_of_a_file_tells_of_lines_lost_and_changed(tmp_p
     for damaged, what in (
         (line(10), "2 of its lines up to step 30 are lost"),
         (b"", "3 of its lines up to step 30 are lost"),
-        (whole[:-10], "1 of its lines up to step 30 are lost"),
+        (whole[:-10], "1 line(s) that cannot be read, set aside in metrics.jsonl.strange"),
         (whole.replace(b"0.1", b"0.3", 1), "lines up to step 30 are not as they were written"),
         (line(10) + line(2**14 + 20) + line(30), "1 line(s) that cannot be read, set aside in metrics.jsonl.strange"),
         (line(10) + b"{\n" + line(30), "1 line(s) that cannot be read, set aside in metrics.jsonl.strange"),
     ):
         path.write_bytes(damaged)
         assert opened(path, 30, mark)[1] == [f"{path}: {what}"]
+    assert line(30)[:-10] + b"\n" in (tmp_path / "metrics.jsonl.strange").read_bytes()

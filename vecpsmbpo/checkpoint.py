@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import sys
 import traceback
 import zlib
 from collections.abc import Callable
@@ -39,9 +40,17 @@ class _OrbaxIsQuiet(logging.Filter):
         return not any("orbax" in file or "tensorstore" in file for file in files)
 
 
+def _unless_given_up(hook: Callable[[Any], object], unraisable: Any) -> None:
+    """Where one file cannot be read or written, orbax closes the loop that waits for the others, and each of them says
+    so, some of them while the process ends."""
+    if "Event loop is closed" not in str(unraisable.exc_value):
+        hook(unraisable)
+
+
 for _name in ("absl", "asyncio"):
     logging.getLogger(_name).addFilter(_OrbaxIsQuiet())
 logging.getLogger("orbax").setLevel(logging.CRITICAL)
+sys.unraisablehook = partial(_unless_given_up, sys.unraisablehook)
 
 
 class Saved(NamedTuple):

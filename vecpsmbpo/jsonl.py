@@ -18,16 +18,20 @@ BATCH = 20_000  # lines that are parsed at a time
 LARGEST_STEP = 2**53  # a whole number that a float holds, too
 
 
-def batches(file: BinaryIO, needed: Iterable[str] = (STEP,)) -> Iterator[list[tuple[bytes, Line | None]]]:
+def batches(
+    file: BinaryIO, needed: Iterable[str] = (STEP,), *, torn: bool = False
+) -> Iterator[list[tuple[bytes, Line | None]]]:
     """The lines of an open file, a batch at a time: each as it stands there, and what it says.
 
     None is a line that is strange: no dictionary, or one without the `needed` numbers. Empty lines are passed over, and
-    so is a last one without its end that cannot be read: it is being written, or was when the machine went down.
+    so is a last one without its end that cannot be read, unless `torn` ones are wanted: it is being written, or was
+    when the machine went down.
     """
     needed = tuple(needed)
     while texts := list(islice(file, BATCH)):
         both = zip(texts, _parse(texts, needed), strict=True)
-        yield [(text, line) for text, line in both if line is not None or (text.strip() and text.endswith(b"\n"))]
+        ended = (b"\n", b"") if torn else b"\n"
+        yield [(text, line) for text, line in both if line is not None or (text.strip() and text.endswith(ended))]
 
 
 def read(path: Path, needed: Iterable[str] = (STEP,)) -> list[Line]:
@@ -127,13 +131,18 @@ class Growing:
         return self.path.with_name(f"{self.path.name}.strange")
 
     def _rewind(self, env_steps: int, needed: tuple[str, ...], written: int, unfinished: bool) -> int:
-        """How many lines are strange; so is one of the first `written` that is beyond `env_steps`."""
+        """How many lines are strange; so is one of the first `written` that is beyond `env_steps`, or has lost its end.
+        (Later ones without an end were being written, and will be again.)"""
         self.path.touch()
         beside, strange, before = self.path.with_suffix(".tmp"), [], 0
         with self.path.open("rb") as file, beside.open("wb") as rewound:
-            for batch in batches(file, needed):
+            for batch in batches(file, needed, torn=True):
                 kept = []
                 for index, (text, line) in enumerate(batch, start=before):
+                    if line is None and not text.endswith(b"\n"):
+                        if index < written:
+                            strange.append(text + b"\n")
+                        continue
                     if line is None or (line[STEP] > env_steps and index < written):
                         strange.append(text)
                         continue

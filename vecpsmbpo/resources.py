@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from vecpsmbpo import limits, replay
+from vecpsmbpo import limits, processes, replay
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.layout import MEMBERS, SEEDS, Layout
 from vecpsmbpo.limits import GIB
@@ -91,6 +91,8 @@ def check_memory(algorithm: Algorithm, shapes: Any) -> str:
     ours = len(layout.mesh.local_devices) / layout.mesh.size  # of several processes, each has its own memory
     state, working = ours * state_bytes(layout, shapes), ours * working_bytes(algorithm)
     working += ours * state_bytes(layout, shapes.without_rings())  # as a stride began, should it have to be undone
+    if _on_cpu(layout) and processes.are_several() and processes.is_first():  # it writes the rings of all
+        working += sum(ring.size * ring.dtype.itemsize for ring in shapes.seeds.rings().values())
     program = PROGRAM_BYTES if _on_cpu(layout) else 0
     free = available_bytes(layout)
     words = f"{state / GIB:.2f} GiB of buffers and networks, {working / GIB:.2f} GiB at work"

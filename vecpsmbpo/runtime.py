@@ -25,10 +25,12 @@ def configure(settings: Settings) -> None:
     a GPU.
 
     Raises:
-        SettingError: XLA does not know a flag in XLA_FLAGS, JAX finds no device, or not the one that JAX_PLATFORMS
-            asks for, or the other processes are not there.
+        SettingError: XLA does not know a flag in XLA_FLAGS, JAX is told to compute in float64, it finds no device, or
+            not the one that JAX_PLATFORMS asks for, or the other processes are not there.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if jax.config.jax_enable_x64:
+        raise SettingError("jax_enable_x64 (JAX_ENABLE_X64): must be off, since this program computes in float32")
     flags = os.environ.get("XLA_FLAGS", "")
     if others := flags.replace(SINGLE_THREADED, "").strip():
         _check_flags(others)

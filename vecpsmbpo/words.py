@@ -40,4 +40,8 @@ def of_environment(error: BaseException) -> str | None:
 
 
 def _first_line(error: BaseException) -> str:
-    return (str(error).strip() or " ").splitlines()[0].strip()[:200]
+    try:
+        said = str(error).strip()
+    except Exception:  # other people's exceptions may fail at saying what they are
+        said = ""
+    return (said or " ").splitlines()[0].strip()[:200]

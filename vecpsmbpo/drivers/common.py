@@ -44,6 +44,10 @@ class Interrupted(Exception):
         self.step, self.state, self.news = step, state, news
 
 
+class Stopped(Exception):
+    """An evaluation was told to stop before its episodes were over."""
+
+
 class EpisodeKeys(NamedTuple):
     """Of evaluation episodes. Resets and actions need keys of their own: what a reset splits its key into are the very
     keys that `fold_in` makes of it for the first steps.
@@ -54,6 +58,10 @@ class EpisodeKeys(NamedTuple):
     policy: jax.Array
     resets: jax.Array
     actions: jax.Array
+
+
+def never() -> bool:
+    return False
 
 
 class Driver(Protocol):
@@ -87,8 +95,18 @@ class Driver(Protocol):
             Interrupted: a simulator failed.
         """
 
-    def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
-        """Whole episodes of the evaluation policy, in environments of their own. keys [S]."""
+    def evaluate(
+        self, state: TrainState, keys: jax.Array, episodes: int, stopping: Callable[[], bool] = never
+    ) -> Returns:
+        """Whole episodes of the evaluation policy, in environments of their own. keys [S].
+
+        Args:
+            stopping: is asked every few steps, in every process, whether to stop.
+
+        Raises:
+            SimulatorError: one failed.
+            Stopped: it was to stop.
+        """
 
     def save_env(self) -> dict[str, Any]:
         """State of simulators that is not part of the train state, in JSON's types."""

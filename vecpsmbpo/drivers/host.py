@@ -16,10 +16,12 @@ from vecpsmbpo.drivers.common import (
     COMPILED_QUICKLY,
     Interrupted,
     Returns,
+    Stopped,
     broadcast_leaves,
     compiled,
     evaluation_actions,
     evaluation_policies,
+    never,
     split_for_episodes,
 )
 from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
@@ -148,7 +150,9 @@ class HostDriver:
         state, end = self._observe(state, memory, transition, truncated, key, keys, following, learning)
         return state, end
 
-    def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
+    def evaluate(
+        self, state: TrainState, keys: jax.Array, episodes: int, stopping: Callable[[], bool] = never
+    ) -> Returns:
         seeds, obs_size = self.layout.num_lanes, self.algorithm.spec.obs_size
         split = split_for_episodes(keys, episodes)
         env_seed = int(jax.random.randint(split.resets[0, 0], (), 0, 2**30))
@@ -163,6 +167,8 @@ class HostDriver:
         for t in itertools.count():
             if not alive.any():
                 break
+            if t % self.settings.stride == 0 and stopping():
+                raise Stopped
             states = self.layout.everywhere(obs.reshape(seeds, episodes, obs_size), BY_SEED)
             now = self.layout.everywhere(jnp.int32(t), SHARED)
             action, memory = act(policies, now, memory, states, split.actions)

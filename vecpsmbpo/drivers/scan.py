@@ -1,6 +1,7 @@
 """MJX environments: real steps, refits, rollouts and updates as one compiled program over the mesh."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +14,11 @@ from vecpsmbpo.drivers.common import (
     COMPILED_QUICKLY,
     EpisodeKeys,
     Returns,
+    Stopped,
     broadcast_leaves,
     compiled,
     evaluation_actions,
+    never,
     split_for_episodes,
 )
 from vecpsmbpo.layout import BY_SEED, SEEDS, SHARED
@@ -41,9 +44,11 @@ class ScanDriver:
             self._init_local, (BY_SEED,) * 2, specs, compiler_options=COMPILED_QUICKLY
         )
         self._run = self.layout.jit_shard_map(self._run_local, (specs, SHARED), (specs, _LOG), donate_argnums=0)
-        self._evaluate = self.layout.jit_shard_map(self._evaluate_local, (specs.seeds, BY_SEED), (BY_SEED, BY_SEED))
+        jit = self.layout.jit_shard_map
+        self._start = jit(self._start_local, (specs.seeds, BY_SEED), (BY_SEED, BY_SEED))
+        self._go_on = jit(self._go_on_local, (BY_SEED,) * 3, BY_SEED, donate_argnums=2)
         self._compiled: Any = None
-        self._compiled_evaluate: Any = None
+        self._compiled_evaluation: Any = None
 
     def begin(self) -> None:
         pass
@@ -56,18 +61,32 @@ class ScanDriver:
 
     def compile(self, state: TrainState) -> None:
         keys = jax.eval_shape(lambda key: split_for_episodes(key, self.settings.eval_episodes), state.seeds.key)
-        programs = [(self._run, (state, jnp.int32(1))), (self._evaluate, (state.seeds, keys))]
-        (self._compiled, self._compiled_evaluate), self.compile_seconds = compiled(programs)
+        policies, episodes = jax.eval_shape(self._start, state.seeds, keys)
+        programs = [
+            (self._run, (state, jnp.int32(1))),
+            (self._start, (state.seeds, keys)),
+            (self._go_on, (policies, keys.actions, episodes)),
+        ]
+        (self._compiled, *evaluation), self.compile_seconds = compiled(programs)
+        self._compiled_evaluation = evaluation
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
         state, log = (self._compiled or self._run)(state, self.layout.everywhere(jnp.int32(strides), SHARED))
         flat = jax.tree.map(lambda x: np.asarray(x)[:strides].reshape(-1, *x.shape[2:]), processes.here(log))
         return state, flat
 
-    def evaluate(self, state: TrainState, keys: jax.Array, episodes: int) -> Returns:
-        program = self._compiled_evaluate if episodes == self.settings.eval_episodes else None
+    def evaluate(
+        self, state: TrainState, keys: jax.Array, episodes: int, stopping: Callable[[], bool] = never
+    ) -> Returns:
+        compiled_for = self._compiled_evaluation if episodes == self.settings.eval_episodes else None
+        start, go_on = compiled_for or (self._start, self._go_on)
         split = self.layout.everywhere(split_for_episodes(keys, episodes), BY_SEED)
-        return Returns(*map(np.asarray, processes.here((program or self._evaluate)(state.seeds, split))))
+        policies, running = start(state.seeds, split)
+        while processes.here(running.alive).any():
+            if stopping():
+                raise Stopped
+            running = go_on(policies, split.actions, running)
+        return Returns(*map(np.asarray, processes.here((running.total, running.length))))
 
     def save_env(self) -> dict[str, Any]:
         return {}  # the environments are part of the train state
@@ -122,27 +141,50 @@ class ScanDriver:
         env = jax.lax.cond(jnp.any(end.done), begin_episodes, lambda env: env, env)
         return TrainState(counters, seeds, env), end
 
-    def _evaluate_local(self, seeds: SeedState, keys: EpisodeKeys) -> tuple[jax.Array, jax.Array]:
+    def _start_local(self, seeds: SeedState, keys: EpisodeKeys) -> tuple[Any, "_Episodes"]:
+        """The evaluation policy of every seed, leaves [S, ...], and its episodes before their first step."""
+
         def one_seed(seed, keys):
-            policy = self.algorithm.evaluation_policy(seed, keys.policy)
-
-            def step(carry):
-                t, memory, env, total, length, alive = carry
-                action, memory = evaluation_actions(self.algorithm, policy, t, memory, env.obs, keys.actions)
-                after = jax.vmap(self._step_env)(env, action)
-                sound = health.sound(env.obs, after.reward, after.obs)
-                total = total + jnp.where(alive & sound, after.reward, 0.0)
-                return t + 1, memory, after, total, length + alive, alive & sound & (after.done == 0)
-
-            def running(carry):
-                t, *_, alive = carry
-                return (t < self.settings.episode_length) & jnp.any(alive)
-
             count = keys.resets.shape[0]
-            start = jax.vmap(self._reset)(keys.resets)
             memory = broadcast_leaves(self.algorithm.memory(), count)
-            carry = (0, memory, start, jnp.zeros(count), jnp.zeros(count, jnp.int32), jnp.ones(count, bool))
-            *_, total, length, _ = jax.lax.while_loop(running, step, carry)
-            return total, length
+            env, zeros = jax.vmap(self._reset)(keys.resets), jnp.zeros(count)
+            begun = _Episodes(jnp.int32(0), memory, env, zeros, zeros.astype(int), zeros == 0)
+            return self.algorithm.evaluation_policy(seed, keys.policy), begun
 
         return jax.vmap(one_seed)(seeds, keys)
+
+    def _go_on_local(self, policies: Any, keys: jax.Array, episodes: "_Episodes") -> "_Episodes":
+        """A stride of every episode. keys [S, E]."""
+
+        def one_seed(policy, keys, episodes):
+            end = episodes.t + self.settings.stride
+
+            def step(now):
+                action, memory = evaluation_actions(self.algorithm, policy, now.t, now.memory, now.env.obs, keys)
+                env = jax.vmap(self._step_env)(now.env, action)
+                sound = health.sound(now.env.obs, env.reward, env.obs)
+                total = now.total + jnp.where(now.alive & sound, env.reward, 0.0)
+                alive = now.alive & sound & (env.done == 0) & (now.t + 1 < self.settings.episode_length)
+                return _Episodes(now.t + 1, memory, env, total, now.length + now.alive, alive)
+
+            return jax.lax.while_loop(lambda now: (now.t < end) & jnp.any(now.alive), step, episodes)
+
+        return jax.vmap(one_seed)(policies, keys, episodes)
+
+
+class _Episodes(NamedTuple):
+    """Evaluation episodes of a seed while they run.
+
+    Attributes:
+        t: [] int, steps so far.
+        memory, env: leaves [E, ...].
+        total, length: [E], returns and steps so far.
+        alive: [E] bool, which are not over.
+    """
+
+    t: jax.Array
+    memory: Any
+    env: Any
+    total: jax.Array
+    length: jax.Array
+    alive: jax.Array

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 import math
+import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,7 +19,11 @@ CHANGEABLE = frozenset(
     | {"distributed", "keep_checkpoints", "loggers", "compile_cache"}
 )
 
+# Above any use, and what building or compiling them would never end with.
 MOST_LANES = 10_000
+MOST_EPISODES = 10_000  # of an evaluation, an environment each
+MOST_LAYERS = 100
+MOST_ROWS = 10_000_000  # of a minibatch, or start states
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,7 +46,7 @@ class Settings:
     epoch_steps: int = whole(1)
     episode_length: int = whole(0)
     train_episode_length: int = whole(0)
-    eval_episodes: int = whole(1)
+    eval_episodes: int = whole(1, MOST_EPISODES)
     eval_policy: str = choice("posterior", "best", "average")
     eval_actions: str = choice("mean", "sampled")
     checkpoint_every: int = whole(1)
@@ -58,10 +63,10 @@ class Settings:
     # dynamics models (A.1)
     n_models: int = whole(1)
     model_hidden_size: int = whole(1)
-    model_hidden_layers: int = whole(1)
+    model_hidden_layers: int = whole(1, MOST_LAYERS)
     model_learning_rate: float = real(0, open_low=True, traced=True)
     model_weight_decay: float = real(0, traced=True)
-    model_batch_size: int = whole(1)
+    model_batch_size: int = whole(1, MOST_ROWS)
     model_update_every: int = whole(1)
     model_patience: int = whole(1)
     model_improvement: float = real(0, 1)
@@ -176,6 +181,16 @@ class Settings:
         yield (
             lanes > MOST_LANES,
             f"num_seeds={self.num_seeds}: at most {MOST_LANES} seeds, each swept value counted, not {lanes}",
+        )
+        yield (
+            lanes * self.eval_episodes > MOST_EPISODES,
+            f"eval_episodes={self.eval_episodes}: at most {MOST_EPISODES} of all seeds together, not "
+            f"{lanes * self.eval_episodes}",
+        )
+        place = os.path.abspath(self.run_dir)
+        yield (
+            "://" in self.run_dir or (os.sep != "\\" and "\\" in place),
+            f"run_dir={self.run_dir}: must be a folder of this machine, without a backslash in its path",
         )
         yield (
             not math.isclose(self.validation_block * self.validation_ratio, 1, rel_tol=1e-2),

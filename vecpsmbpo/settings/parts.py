@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 
-from vecpsmbpo.settings.base import Settings
+from vecpsmbpo.settings.base import MOST_LAYERS, MOST_ROWS, Settings
 from vecpsmbpo.settings.fields import choice, real, whole
 
 
@@ -12,7 +12,7 @@ class PolicySettings(Settings):
     """Of learned policies."""
 
     policy_hidden_size: int = whole(1)
-    policy_hidden_layers: int = whole(1)
+    policy_hidden_layers: int = whole(1, MOST_LAYERS)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -20,7 +20,7 @@ class SacSettings(PolicySettings):
     """Of `sac` (A.2)."""
 
     policy_learning_rate: float = real(0, open_low=True, traced=True)
-    policy_batch_size: int = whole(1)
+    policy_batch_size: int = whole(1, MOST_ROWS)
     updates_per_step: int = whole(1)
     discount: float = real(0, 1, traced=True)
     target_entropy: float = real(traced=True)
@@ -43,7 +43,7 @@ class SacSettings(PolicySettings):
 class ImaginationSettings(SacSettings):
     """Of `imagination`, which rolls these policies out."""
 
-    rollout_starts: int = whole(1)
+    rollout_starts: int = whole(1, MOST_ROWS)
     imagined_capacity: int = whole(1)
     horizon_first: int = whole(1)
     horizon_last: int = whole(1)

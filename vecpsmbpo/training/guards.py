@@ -4,11 +4,8 @@ that is not given; and what ends a run that is not a mistake in its settings."""
 import contextlib
 import errno
 import os
-import sys
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from vecpsmbpo import checkpoint, jsonl, metrics, shortages, words
 from vecpsmbpo.settings import SettingError
@@ -79,22 +76,13 @@ def disk_errors(run_dir: Path) -> Iterator[None]:
     Raises:
         DiskError: it cannot.
     """
-    hook = sys.unraisablehook
-    sys.unraisablehook = partial(_unless_given_up, hook)
     try:
         yield
-        sys.unraisablehook = hook  # after an error more of them may come until the process ends
     except (OSError, ValueError) as error:
         number = shortages.number_of(error)
         if number not in shortages.OF_DISKS:
             raise
         raise DiskError(f"run_dir={run_dir}: cannot be written ({os.strerror(number)})") from None
-
-
-def _unless_given_up(hook: Callable[[Any], object], unraisable: Any) -> None:
-    """Where one file cannot be written, orbax closes the loop that waits for the others, and each of them says so."""
-    if "Event loop is closed" not in str(unraisable.exc_value):
-        hook(unraisable)
 
 
 @contextlib.contextmanager

@@ -22,7 +22,7 @@ from vecpsmbpo import (
     versions,
     words,
 )
-from vecpsmbpo.drivers import Driver, Interrupted, Returns
+from vecpsmbpo.drivers import Driver, Interrupted, Returns, Stopped
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.look import render, report
 from vecpsmbpo.programs import evaluation_keys, initial_inputs, make_driver
@@ -89,7 +89,7 @@ def _train(settings: Settings, stop: Stop | None) -> int:
         stop = around.enter_context(heeding_signals()) if stop is None else stop
         crash.doing(_among("making the first state"), run_dir)
         with _leaving_together(), contextlib.ExitStack() as opened:
-            return _Session(settings, driver, shapes, memory, opened).go(stop)
+            return _Session(settings, driver, shapes, memory, stop, opened).go()
 
 
 @contextlib.contextmanager
@@ -107,13 +107,19 @@ class _Session:
     """One session of a run: from a checkpoint, or from nothing, to its end or a signal."""
 
     def __init__(
-        self, settings: Settings, driver: Driver, shapes: TrainState, memory: str, opened: contextlib.ExitStack
+        self,
+        settings: Settings,
+        driver: Driver,
+        shapes: TrainState,
+        memory: str,
+        stop: Stop,
+        opened: contextlib.ExitStack,
     ):
         """
         Args:
             opened: closes what is opened here.
         """
-        self.settings, self.driver = settings, driver
+        self.settings, self.driver, self.stop = settings, driver, stop
         self.run_dir = Path(settings.run_dir)
         keep = settings.keep_checkpoints
         with processes.together():
@@ -130,7 +136,7 @@ class _Session:
         if saved:
             driver.load_env(saved.host["env"])
         self.env_steps = saved.step if saved else 0
-        # Whether the epoch that ends here has not been evaluated yet: a simulator failed in that.
+        # Whether the epoch that ends here has not been evaluated yet: a simulator failed in that, or it was stopped.
         self.to_evaluate = bool(saved and saved.host.get("to_evaluate"))
         self.health = processes.here(self.state.seeds.health)
         self.frozen = np.asarray(health.frozen(self.health))
@@ -150,12 +156,16 @@ class _Session:
         self.epoch_steps_done = 0
         self.stride_s = float("inf")  # seconds per stride in the last chunk; infinite: not known
 
-    def go(self, stop: Stop) -> int:
+    @property
+    def _complete(self) -> bool:
+        return self.env_steps >= self.settings.total_steps and not self.to_evaluate
+
+    def go(self) -> int:
         settings = self.settings
         try:
             with self.display:
                 self._introduce()
-                if self.env_steps >= settings.total_steps and not self.to_evaluate:
+                if self._complete:
                     self.display.say(sayings.complete(self.env_steps))
                     return self._status
                 if self.frozen.all():
@@ -170,7 +180,7 @@ class _Session:
                 self._compile()
                 if self.to_evaluate:
                     self._end_epoch()
-                while self.env_steps < settings.total_steps and not self.frozen.all() and not self._asked_to(stop):
+                while self.env_steps < settings.total_steps and not self.frozen.all() and not self._asked_to_stop():
                     self._chunk()
                 self._save()
                 self._film()
@@ -180,12 +190,12 @@ class _Session:
         except SimulatorError as error:
             raise self._failed(f"in the evaluation at step {self.env_steps}", error) from error
 
-    def _asked_to(self, stop: Stop) -> bool:
+    def _asked_to_stop(self) -> bool:
         """Whether signals have asked any process to stop; saves first, if it is that which they asked for."""
-        if processes.greatest(int(stop.save)):
-            stop.save = False
+        if processes.greatest(int(self.stop.save)):
+            self.stop.save = False
             self._save()
-        self.stopped_by = processes.greatest(stop.requested or 0)
+        self.stopped_by = processes.greatest(self.stop.requested or 0)
         return self.stopped_by > 0
 
     def _devices(self) -> list[str]:
@@ -250,10 +260,13 @@ class _Session:
         settings = self.settings
         seconds = time.perf_counter() - self.epoch_began
         keys = evaluation_keys(settings, self.env_steps)
+        self.to_evaluate = True  # in what is saved until it is done
         try:
-            returns = self.driver.evaluate(self.state, keys, settings.eval_episodes)
+            returns = self.driver.evaluate(self.state, keys, settings.eval_episodes, self._asked_to_stop)
+        except Stopped:
+            self._save()
+            return
         except SimulatorError:
-            self.to_evaluate = True
             self._save()
             raise
         self.to_evaluate = False
@@ -273,7 +286,7 @@ class _Session:
         """An episode of a run that is complete, where somebody will see it: on its page, or at a logger's server."""
         settings = self.settings
         seen = settings.report or not {loggers.TENSORBOARD}.issuperset(settings.loggers)
-        if not seen or self.env_steps < settings.total_steps or settings.plans_actions or not processes.is_first():
+        if not seen or not self._complete or settings.plans_actions or not processes.is_first():
             return
         self.display.say("filming an episode …")
         render.keep(self.run_dir, words.warn)
@@ -354,10 +367,10 @@ class _Session:
                 resources.check_disk(self.run_dir, self.state, env_steps, self.driver.layout)
 
     def _farewell(self) -> int:
-        for line in sayings.farewell(self.settings, self.env_steps, all_frozen=bool(self.frozen.all())):
+        ends = {"all_frozen": bool(self.frozen.all()), "complete": self._complete}
+        for line in sayings.farewell(self.settings, self.env_steps, **ends):
             self.display.say(line)
-        ended = self.frozen.all() or self.env_steps >= self.settings.total_steps
-        return self._status if ended else 128 + self.stopped_by
+        return self._status if any(ends.values()) else 128 + self.stopped_by
 
     def _failed(self, where: str, error: Exception) -> TaskFailed:
         return TaskFailed(sayings.failed(self.settings, where, error, self.saved_step))

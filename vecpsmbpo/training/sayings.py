@@ -58,13 +58,13 @@ def unsound(settings: Settings, steps: int, of_steps: int) -> str:
     )
 
 
-def farewell(settings: Settings, env_steps: int, *, all_frozen: bool) -> Iterator[str]:
+def farewell(settings: Settings, env_steps: int, *, all_frozen: bool, complete: bool) -> Iterator[str]:
     """Where it is saved, and what may be done with that."""
     run_dir = Path(settings.run_dir)
     yield f"saved at step {env_steps} of {settings.total_steps}: {run_dir}"
     if all_frozen:
         yield "stopped: every lane is frozen; what is saved is the last good state of each"
-    elif env_steps < settings.total_steps:
+    elif not complete:
         yield f"to continue: {to_continue(settings)}"
     else:
         yield f"to evaluate: vecpsmbpo eval {shlex.quote(f'run_dir={run_dir}')} episodes=10"
