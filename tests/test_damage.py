@@ -24,7 +24,7 @@ from tests.helpers import (
 )
 from tools.harm.runs import NotTried
 from tools.harm.scarce import mounted
-from vecpsmbpo import cli, config, evaluate, jsonl, metrics, placement, recorded, training
+from vecpsmbpo import checkpoint, cli, config, evaluate, jsonl, metrics, placement, recorded, training
 from vecpsmbpo.drivers.host import HostDriver
 from vecpsmbpo.envs.host.batched import SimulatorError
 from vecpsmbpo.envs.host.dm_control import DmControlSimulator
@@ -125,6 +125,14 @@ def _flip(path: Path, at: float = 0.5, bit: int = 4) -> None:
 def _host(run_dir: Path, step: int) -> Path:
     """What the host knows beside the state, in a checkpoint."""
     return run_dir / "checkpoints" / str(step) / "host" / "metadata"
+
+
+def test_what_orbax_says_of_files_that_it_has_given_up_is_not_heard():
+    heard: list[types.SimpleNamespace] = []
+    given_up, other = (types.SimpleNamespace(exc_value=RuntimeError(x)) for x in ("Event loop is closed", "no"))
+    for unraisable in (given_up, other):
+        checkpoint._unless_given_up(heard.append, unraisable)
+    assert heard == [other]
 
 
 def test_a_flipped_bit_is_a_damaged_checkpoint(short_run, tmp_path, capsys):

@@ -9,6 +9,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import types
 
 import jax
 import pytest
@@ -95,6 +96,21 @@ def test_an_exception_in_one_line_says_where_it_was_raised():
     with pytest.raises(KeyError) as found:
         {}["x"]
     assert re.fullmatch(rf"KeyError: 'x' at {__file__}:\d+", words.of(found.value))
+
+
+def test_an_exception_in_one_line_says_no_more_than_it_can():
+    class Speechless(Exception):
+        def __str__(self):
+            raise ValueError
+
+    assert words.of(Speechless()) == "Speechless"
+
+
+def test_float64_is_refused(monkeypatch):
+    told = types.SimpleNamespace(config=types.SimpleNamespace(jax_enable_x64=True))
+    monkeypatch.setattr(runtime, "jax", told)
+    with pytest.raises(SettingError, match=r"^jax_enable_x64 \(JAX_ENABLE_X64\): must be off"):
+        runtime.configure(tiny())
 
 
 @pytest.mark.parametrize("error", [RuntimeError("Unable to initialize backend"), AssertionError()])

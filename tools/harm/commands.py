@@ -28,6 +28,7 @@ SETTINGS = [
         "seed=[",
         "seed='",
     ),
+    *("rollout_starts=2e9", "policy_hidden_layers=2000", "eval_episodes=1e9", "run_dir='a\\b'", "run_dir=gs://b"),
     *("experiment=fig2", "hydra.nosuch=1", "env=hopper env.id=x", "n_models=1,2", "validation_ratio=0.3", "devices=-1"),
     *("distributed=maybe", "distributed=a:1/2/2"),
 ]

@@ -24,6 +24,7 @@ from tools.harm.runs import (
 from vecpsmbpo import checkpoint
 
 TO_LIVE_S = 10.0
+LONG_EVALUATION = ("eval_episodes=20", "episode_length=1000", "train_episode_length=25")  # of some seconds
 # After the start of a process: Python itself is up by the first, and training begins after the last.
 IMPORTING_S = (0.4, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5)
 KILLS = 5  # of a trial
@@ -35,14 +36,20 @@ def signals(folder: Path, options: dict) -> Iterator[Trial]:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         name = signal.Signals(number).name
         yield f"{name}, killed {TO_LIVE_S:.0f} s later", partial(_asked_to_stop, folder / name, number, reference)
+    reference = undisturbed(folder, "host", *LONG_EVALUATION)
+    attempt = partial(_asked_to_stop, folder / "evaluating", signal.SIGTERM, reference, *LONG_EVALUATION)
+    yield f"SIGTERM in an evaluation, killed {TO_LIVE_S:.0f} s later", attempt
     for after in IMPORTING_S:
         yield f"SIGINT {after} s after the start", partial(_interrupted, folder, after)
 
 
-def _asked_to_stop(run_dir: Path, number: signal.Signals, reference: Path) -> str:
+def _asked_to_stop(run_dir: Path, number: signal.Signals, reference: Path, *more: str) -> str:
     folder = run_dir.parent
-    process = started(*RUN, "backend=host", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
+    process = started(*RUN, *more, "backend=host", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
     said_until(process, "step")
+    if more:
+        said_until(process, "step      40")  # the evaluation there begins
+        time.sleep(1)
     process.send_signal(number)
     try:
         said, errors = process.communicate(timeout=TO_LIVE_S)

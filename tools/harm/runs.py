@@ -150,8 +150,9 @@ def said_until(process: subprocess.Popen, word: str) -> None:
     next((line for line in process.stdout if line.startswith(word)), None)
 
 
-def undisturbed(folder: Path, backend: str) -> Path:
-    run_dir = folder / f"undisturbed_{backend}"
-    result = command(*RUN, f"backend={backend}", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
+def undisturbed(folder: Path, backend: str, *more: str) -> Path:
+    """The run that others are compared with, where it lies; `more` settings have one of their own."""
+    run_dir = folder / f"undisturbed_{backend}{len(more) or ''}"
+    result = command(*RUN, *more, f"backend={backend}", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
     assert result.returncode == 0, result.stderr
     return run_dir
