@@ -1,6 +1,7 @@
 """Processes that are told to end, or killed, and a second one in the directory of a run."""
 
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -13,6 +14,7 @@ from tools.harm.runs import (
     ONE_LINE,
     RUN,
     SAME,
+    SAVED,
     Trial,
     command,
     one_line,
@@ -25,7 +27,7 @@ from vecpsmbpo import checkpoint
 
 TO_LIVE_S = 10.0
 LONG_EVALUATION = ("eval_episodes=20", "episode_length=1000", "train_episode_length=25")  # of some seconds
-# After the start of a process: Python itself is up by the first, and training begins after the last.
+# After the start of a process: Python itself is up by the first, and on most machines training begins after the last.
 IMPORTING_S = (0.4, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5)
 KILLS = 5  # of a trial
 
@@ -67,8 +69,12 @@ def _interrupted(folder: Path, after_s: float) -> str:
     process = started(*RUN, "backend=host", "run_dir=early", cwd=folder)
     time.sleep(after_s)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate()
-    return "it has begun" if (folder / "early").exists() else one_line(process.returncode, errors, expected=130)
+    said, errors = process.communicate()
+    if not (folder / "early").exists():
+        return one_line(process.returncode, errors, expected=130)
+    shutil.rmtree(folder / "early")  # a fast machine: it trained already, and had to save
+    saved = process.returncode == 128 + signal.SIGINT and "to continue: " in said
+    return SAVED if saved else f"status {process.returncode}: {errors[-200:]!r}"
 
 
 def twice(folder: Path, options: dict) -> Iterator[Trial]:

@@ -28,8 +28,8 @@ NATIVE = re.compile(
 )
 # The end of the line that an abort may have torn; an empty one where it did not.
 BEGUN_ANEW = re.compile(r"(^|\n)\n(?=vecpsmbpo: crashed \(Aborted\))")
-SAME, SAID, ONE_LINE = "same end", "same state, lost lines are said", "one line"
-FINE = (SAME, SAID, ONE_LINE)
+SAME, SAID, ONE_LINE, SAVED = "same end", "same state, lost lines are said", "one line", "it had begun, and saved"
+FINE = (SAME, SAID, ONE_LINE, SAVED)
 # What is tried, and what tries it and returns how it ended: one of FINE, or what was wrong.
 Trial = tuple[str, Callable[[], str]]
 
