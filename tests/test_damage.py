@@ -205,8 +205,9 @@ def test_what_is_wrong_with_the_logs_is_said_when_a_run_goes_on(short_run, tmp_p
     assert metrics_file.read_bytes() == first + third
     said = capsys.readouterr().err
     assert f"{metrics_file}: 2 line(s) that cannot be read, set aside in metrics.jsonl.strange" in said
+    assert f"{episodes_file}: 1 line(s) that cannot be read, set aside in episodes.jsonl.strange" in said  # cut in half
     assert "of its lines up to step 120 are lost" in said
-    assert said.count("\n") == 2
+    assert said.count("\n") == 3
 
 
 def test_a_simulator_that_fails_costs_its_stride_and_no_more(short_run, tmp_path, monkeypatch, capsys):
@@ -285,7 +286,33 @@ def test_a_signal_in_an_evaluation_is_heeded(stopped_at, short_run, tmp_path, mo
     assert all(line["env_steps"] < stopped_at for line in jsonl.read(tmp_path / "run" / "metrics.jsonl"))
     monkeypatch.undo()
     assert training.train(settings) == 0
-    assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
+    _assert_done(settings, short_run, capsys)
+
+
+def test_a_save_in_the_last_evaluation_is_made_whole_when_it_is_over(short_run, tmp_path, monkeypatch, capsys):
+    """What Slurm's SIGTERM asks for: to save, and to go on."""
+    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
+    evaluated, stop = HostDriver.evaluate, Stop()
+
+    def signalled(driver, state, *args):
+        stop.save = int(state.counters.env_steps) == settings.total_steps
+        return evaluated(driver, state, *args)
+
+    monkeypatch.setattr(HostDriver, "evaluate", signalled)
+    assert training.train(settings, stop) == 0
+    _assert_done(settings, short_run, capsys)
+
+
+def _assert_done(settings, reference, capsys):
+    """It is what the undisturbed run is, and knows that it is complete."""
+    assert_same_run(Path(settings.run_dir), Path(reference.run_dir))
+    capsys.readouterr()
+    before = {name: content for name, content in _files(Path(settings.run_dir)).items() if "tensorboard" not in name}
+    assert training.train(settings) == 0
+    said = capsys.readouterr()
+    assert "already complete at" in said.out
+    assert said.err == ""
+    assert _files(Path(settings.run_dir)).items() >= before.items()
 
 
 @pytest.mark.parametrize("begun", [False, True])

@@ -9,7 +9,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import types
 
 import jax
 import pytest
@@ -106,11 +105,14 @@ def test_an_exception_in_one_line_says_no_more_than_it_can():
     assert words.of(Speechless()) == "Speechless"
 
 
-def test_float64_is_refused(monkeypatch):
-    told = types.SimpleNamespace(config=types.SimpleNamespace(jax_enable_x64=True))
-    monkeypatch.setattr(runtime, "jax", told)
-    with pytest.raises(SettingError, match=r"^jax_enable_x64 \(JAX_ENABLE_X64\): must be off"):
-        runtime.configure(tiny())
+def test_float64_is_refused():
+    jax.config.update("jax_enable_x64", True)
+    try:
+        for check in (lambda: runtime.configure(tiny()), runtime.check_float32):
+            with pytest.raises(SettingError, match=r"^jax_enable_x64 \(JAX_ENABLE_X64\): must be off"):
+                check()
+    finally:
+        jax.config.update("jax_enable_x64", False)
 
 
 @pytest.mark.parametrize("error", [RuntimeError("Unable to initialize backend"), AssertionError()])

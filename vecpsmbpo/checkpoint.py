@@ -18,7 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import type_handlers
 
-from vecpsmbpo import placement, processes, recorded, shortages
+from vecpsmbpo import atomic, placement, processes, recorded, shortages
 from vecpsmbpo.algorithms import TABLE
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import SettingError, Settings
@@ -133,6 +133,17 @@ class Checkpoints:
         items = ocp.args.Composite(state=ocp.args.PyTreeSave(plain, save_args=chunks), host=ocp.args.JsonSave(host))
         self._manager.save(step, args=items, force=True)
         self._manager.wait_until_finished()
+
+    def amend(self, step: int, host: dict[str, Any]) -> None:
+        """Says of the checkpoint at `step` what the host has come to know since it was saved. All processes of a run
+        call it, and the first one writes."""
+        with processes.together():
+            if processes.is_first():
+                path = self._directory / str(step) / "host" / "metadata"
+                stored = json.loads(path.read_text())
+                del stored["sum"]
+                host = json.loads(json.dumps({**stored, **host}))
+                atomic.write_text(path, json.dumps({**host, "sum": _sum(host)}))
 
     def restore(
         self, shapes: TrainState, layout: Layout, warn: Callable[[str], None], at: int | None = None

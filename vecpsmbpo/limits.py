@@ -1,6 +1,5 @@
 """How much address space the system lets this process have (`ulimit -v`, and queues of clusters that set it)."""
 
-import sys
 from pathlib import Path
 
 from vecpsmbpo.settings import SettingError
@@ -33,8 +32,6 @@ def check_start() -> None:
     Raises:
         SettingError: it cannot.
     """
-    if "jax" in sys.modules:
-        return
     free = free_address_space()
     if free < START_BYTES:
         raise SettingError(

@@ -7,7 +7,7 @@ from importlib import import_module
 import jax
 import jax.numpy as jnp
 
-from vecpsmbpo import envs
+from vecpsmbpo import envs, runtime
 from vecpsmbpo.algorithms import TABLE
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.drivers import Driver, HostDriver, ScanDriver
@@ -20,10 +20,11 @@ def make_driver(settings: Settings) -> Driver:
     """The algorithm on the task, on this process's devices. `runtime.configure` comes first.
 
     Raises:
-        SettingError: there is no such task (`envs.make`).
+        SettingError: there is no such task (`envs.make`), or it has JAX compute in float64.
     """
     make_env = partial(envs.make, settings.env, settings.backend, **dict(settings.env_options))
     env = make_env(num_envs=len(settings.lanes), seed=settings.seed)
+    runtime.check_float32()  # the task's module may have changed it
     if not settings.episode_length:
         settings = dataclasses.replace(settings, episode_length=env.spec.episode_length)
     algorithm = make_algorithm(settings, env.spec)

@@ -29,8 +29,7 @@ def configure(settings: Settings) -> None:
             not the one that JAX_PLATFORMS asks for, or the other processes are not there.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if jax.config.jax_enable_x64:
-        raise SettingError("jax_enable_x64 (JAX_ENABLE_X64): must be off, since this program computes in float32")
+    check_float32()
     flags = os.environ.get("XLA_FLAGS", "")
     if others := flags.replace(SINGLE_THREADED, "").strip():
         _check_flags(others)
@@ -53,6 +52,14 @@ def configure(settings: Settings) -> None:
         asked = os.environ.get("JAX_PLATFORMS")
         what = f"JAX_PLATFORMS={asked}: no such device here" if asked else f"JAX finds no device ({words.of(error)})"
         raise SettingError(what) from None
+
+
+def check_float32() -> None:
+    """Raises:
+    SettingError: JAX is told to compute in float64, by the environment or by a task's own code.
+    """
+    if jax.config.jax_enable_x64:
+        raise SettingError("jax_enable_x64 (JAX_ENABLE_X64): must be off, since this program computes in float32")
 
 
 @functools.cache

@@ -1,5 +1,6 @@
 """Processes that are told to end, or killed, and a second one in the directory of a run."""
 
+import json
 import random
 import shutil
 import signal
@@ -50,16 +51,19 @@ def _asked_to_stop(run_dir: Path, number: signal.Signals, reference: Path, *more
     process = started(*RUN, *more, "backend=host", f"total_steps={END}", f"run_dir={run_dir}", cwd=folder)
     said_until(process, "step")
     if more:
-        said_until(process, "step      40")  # the evaluation there begins
-        time.sleep(1)
+        time.sleep(2)  # into the first evaluation
     process.send_signal(number)
     try:
         said, errors = process.communicate(timeout=TO_LIVE_S)
     except subprocess.TimeoutExpired:
         process.kill()
         said, errors = process.communicate()
+    newest = max((run_dir / checkpoint.FOLDER).glob("[0-9]*"), key=lambda path: int(path.name))
+    evaluating = json.loads((newest / "host" / "metadata").read_text())["to_evaluate"]
     command(f"run_dir={run_dir}", cwd=folder)
     ended = same_end(run_dir, reference)
+    if more and not evaluating:
+        ended = f"{ended}, but it met no evaluation"
     if process.returncode != 128 + number or "to continue: " not in said:
         ended = f"{ended}, but status {process.returncode}: {errors[-200:]!r}"
     return ended

@@ -272,6 +272,9 @@ class _Session:
         self.to_evaluate = False
         lines = [line for line, frozen in zip(self._lines(returns, seconds), self.frozen, strict=True) if not frozen]
         self.log.metrics(lines)
+        if self.saved_step == self.env_steps:  # while it was evaluated, or before
+            known = {"seconds": self.watch(), "logs": self.log.marks, "to_evaluate": False}
+            self.checkpoints.amend(self.env_steps, known)
         self.display.epoch(self.env_steps, float(np.mean([line["eval_return"] for line in lines])))
         if unsound := sum(line["unsound_steps"] for line in lines):
             self.display.say(sayings.unsound(self.settings, unsound, len(lines) * settings.epoch_steps))
