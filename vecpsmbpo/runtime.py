@@ -58,7 +58,7 @@ def check_float32() -> None:
     """Raises:
     SettingError: JAX is told to compute in float64, by the environment or by a task's own code.
     """
-    if jax.config.jax_enable_x64:
+    if jax.config.values["jax_enable_x64"]:
         raise SettingError("jax_enable_x64 (JAX_ENABLE_X64): must be off, since this program computes in float32")
 
 

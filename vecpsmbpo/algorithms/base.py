@@ -292,7 +292,7 @@ class Algorithm(ABC):
         added = counters.env_steps
         split = dynamics.Split.draw(split_key, added, settings.replay_capacity, settings.validation_block)
         scaling = dynamics.scaling(state.moments, added, settings)
-        how = {"net": self.model_net, "settings": settings, "spec": self.spec}
+        how: dict[str, Any] = {"net": self.model_net, "settings": settings, "spec": self.spec}
 
         def fit(model, key, real, split, scaling, hyper):
             return dynamics.fit(model, real, split, scaling, hyper, key, **how)
