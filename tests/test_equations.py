@@ -44,12 +44,12 @@ def test_log_variance_is_clamped_softly(key):
 def test_prediction_adds_the_residual_to_the_state_and_whitens_its_inputs(key):
     """Equations 20 and 21: with zero weights the outputs are the biases, whatever the input."""
     settings, spec = tiny(), specs.get("hopper")
-    model = jax.jit(partial(dynamics.init, settings=settings, spec=spec))(key, Hyper.of(settings))
+    net = dynamics.network(settings, spec)
+    model = jax.jit(partial(dynamics.init, net=net, settings=settings, spec=spec))(key, Hyper.of(settings))
     params = jax.tree.map(jnp.zeros_like, model.params)
     size = spec.obs_size + 1
     bias = jnp.concatenate([jnp.arange(size, dtype=jnp.float32), jnp.full(size, -1e3)])
     params["params"]["Dense_2"]["bias"] = bias
-    net = dynamics.network(settings, spec)
     obs, action = jnp.ones(spec.obs_size), jnp.zeros(spec.action_size)
     next_obs, reward, _ = dynamics.predict(model.replace(params=params), obs, action, key, net=net, spec=spec)
     noise = 5 * np.exp(-5.0)  # five standard deviations at the lower bound of the variance

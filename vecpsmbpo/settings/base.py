@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import itertools
 import math
-import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -186,11 +185,6 @@ class Settings:
             lanes * self.eval_episodes > MOST_EPISODES,
             f"eval_episodes={self.eval_episodes}: at most {MOST_EPISODES} of all seeds together, not "
             f"{lanes * self.eval_episodes}",
-        )
-        place = os.path.abspath(self.run_dir)
-        yield (
-            "://" in self.run_dir or (os.sep != "\\" and "\\" in place),
-            f"run_dir={self.run_dir}: must be a folder of this machine, without a backslash in its path",
         )
         yield (
             not math.isclose(self.validation_block * self.validation_ratio, 1, rel_tol=1e-2),

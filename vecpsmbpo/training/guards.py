@@ -28,6 +28,14 @@ class TaskFailed(Exception):
     """The task's own code failed; says where, and how to go on from what is saved."""
 
 
+def check_place(run_dir: str) -> None:
+    """Raises:
+    SettingError: tensorstore, which writes the checkpoints, would take it for another place.
+    """
+    if "://" in run_dir or (os.sep != "\\" and "\\" in os.path.abspath(run_dir)):
+        raise SettingError(f"run_dir={run_dir}: must be a folder of this machine, without a backslash in its path")
+
+
 def has_checkpoint(run_dir: Path) -> bool:
     return any(path.name.isdecimal() for path in (run_dir / checkpoint.FOLDER).glob("*"))
 

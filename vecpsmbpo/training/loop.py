@@ -34,6 +34,7 @@ from vecpsmbpo.training.guards import (
     TaskFailed,
     alone_in,
     check_not_emptied,
+    check_place,
     disk_errors,
     has_checkpoint,
     memory_errors,
@@ -62,6 +63,7 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
         OutOfMemory: the system gives no more.
         LostProcess: another process of the run is gone.
     """
+    check_place(settings.run_dir)
     runtime.configure(settings)
     try:
         return _train(settings, stop)
