@@ -117,11 +117,11 @@ def test_a_rollout_that_terminates_is_stored_and_begins_again_from_a_real_state(
 
 def test_what_a_model_makes_infinite_is_noted_and_not_stored(imagined):
     """Model 0 comes to -3e38 within three steps; the others pass float32's -3.4e38 at their second, n = 1 first."""
-    assert int(imagined[2].seen[0]) == health.NOWHERE
+    assert int(imagined[2].passing[0]) == health.NOWHERE
     settings = tiny(n_models=N, n_policies=M, rollout_starts=8, horizon_first=3, horizon_last=3)
     rows, _, after = imagine(settings, change=-1e38)
     expected = health.note(health.init(), health.IMAGINED, jnp.bool_(True), M)  # the first member of model 1
-    assert int(after.seen[0]) == int(expected.seen)
+    assert int(after.passing[0]) == int(expected.seen)
     for member, data in enumerate(rows):
         assert all(np.isfinite(leaf).all() for leaf in data)
         lost = [t for t in range(3) if not np.any(data.next_obs[8 * t : 8 * t + 8])]
