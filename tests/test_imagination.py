@@ -121,7 +121,7 @@ def test_what_a_model_makes_infinite_is_noted_and_not_stored(imagined):
     settings = tiny(n_models=N, n_policies=M, rollout_starts=8, horizon_first=3, horizon_last=3)
     rows, _, after = imagine(settings, change=-1e38)
     expected = health.note(health.init(), health.IMAGINED, jnp.bool_(True), M)  # the first member of model 1
-    assert int(after.passing[0]) == int(expected.seen)
+    assert int(after.passing[0]) == int(expected.passing)
     for member, data in enumerate(rows):
         assert all(np.isfinite(leaf).all() for leaf in data)
         lost = [t for t in range(3) if not np.any(data.next_obs[8 * t : 8 * t + 8])]
