@@ -128,9 +128,8 @@ class Checkpoints:
             "settings": recorded.plain(self._settings),
             "arrays": _arrays_sum(plain),
         }
-        host = json.loads(json.dumps({**host, **about}))  # as it will be read
-        host["sum"] = _sum(host)
-        items = ocp.args.Composite(state=ocp.args.PyTreeSave(plain, save_args=chunks), host=ocp.args.JsonSave(host))
+        known = ocp.args.JsonSave(_summed({**host, **about}))
+        items = ocp.args.Composite(state=ocp.args.PyTreeSave(plain, save_args=chunks), host=known)
         self._manager.save(step, args=items, force=True)
         self._manager.wait_until_finished()
 
@@ -142,8 +141,7 @@ class Checkpoints:
                 path = self._directory / str(step) / "host" / "metadata"
                 stored = json.loads(path.read_text())
                 del stored["sum"]
-                host = json.loads(json.dumps({**stored, **host}))
-                atomic.write_text(path, json.dumps({**host, "sum": _sum(host)}))
+                atomic.write_text(path, json.dumps(_summed({**stored, **host})))
 
     def restore(
         self, shapes: TrainState, layout: Layout, warn: Callable[[str], None], at: int | None = None
@@ -212,6 +210,12 @@ def _alone() -> Any:
         return ocp.options.MultiprocessingOptions()
     index = jax.process_index()
     return ocp.options.MultiprocessingOptions(index, {index}, barrier_sync_key_prefix=f"process{index}")
+
+
+def _summed(host: dict[str, Any]) -> dict[str, Any]:
+    """With its checksum, as it will be read."""
+    host = json.loads(json.dumps(host))
+    return {**host, "sum": _sum(host)}
 
 
 def _sum(host: dict[str, Any]) -> int:

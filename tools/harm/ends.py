@@ -58,15 +58,21 @@ def _asked_to_stop(run_dir: Path, number: signal.Signals, reference: Path, *more
     except subprocess.TimeoutExpired:
         process.kill()
         said, errors = process.communicate()
-    newest = max((run_dir / checkpoint.FOLDER).glob("[0-9]*"), key=lambda path: int(path.name))
-    evaluating = json.loads((newest / "host" / "metadata").read_text())["to_evaluate"]
+    met = not more or _is_to_evaluate(run_dir)
     command(f"run_dir={run_dir}", cwd=folder)
     ended = same_end(run_dir, reference)
-    if more and not evaluating:
+    if not met:
         ended = f"{ended}, but it met no evaluation"
     if process.returncode != 128 + number or "to continue: " not in said:
         ended = f"{ended}, but status {process.returncode}: {errors[-200:]!r}"
     return ended
+
+
+def _is_to_evaluate(run_dir: Path) -> bool:
+    """Whether the newest checkpoint was saved in an evaluation. What a killed save left is none."""
+    saved = [path for path in (run_dir / checkpoint.FOLDER).iterdir() if path.name.isdecimal()]
+    newest = max(saved, key=lambda path: int(path.name))
+    return bool(json.loads((newest / "host" / "metadata").read_text())["to_evaluate"])
 
 
 def _interrupted(folder: Path, after_s: float) -> str:
