@@ -90,8 +90,9 @@ def test_who_takes_films_gets_one_of_a_run_that_is_complete(given, step, filmed,
     monkeypatch.setattr(loop.report, "keep", lambda run_dir, warn: (run_dir / "report.html").write_text("a page"))
     settings = dataclasses.replace(tiny(algo=given.pop("algo", "ops_mbpo")), **given)
     said = types.SimpleNamespace(say=lambda text: None)
-    session = types.SimpleNamespace(settings=settings, env_steps=step, run_dir=tmp_path, display=said)
-    loop._Session._film(session)
+    session = object.__new__(loop._Session)  # without the driver that it is opened with
+    vars(session).update(settings=settings, env_steps=step, to_evaluate=False, run_dir=tmp_path, display=said)
+    session._film()
     assert (tmp_path / "episode.gif").exists() == filmed
     assert (tmp_path / "report.html").exists() == settings.report
     if settings.loggers == ("wandb",):

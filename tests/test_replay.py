@@ -75,7 +75,8 @@ def test_each_row_of_a_minibatch_is_real_with_probability_lambda(key, real_ratio
     state = jax.tree.map(lambda x: x[0], initial(learner))
     state = state.replace(real=jnp.ones_like(state.real))
     counters = Counters(jnp.int32(50), jnp.int32(16))
-    batches = jax.jit(learner.minibatches)(counters, state, 2 * jnp.ones_like(state.imagined[0]), real_ratio, key)
+    ring = jnp.full((128, state.real.shape[-1]), 2.0)  # given at λ = 1, too, as it is where other seeds imagine
+    batches = jax.jit(learner.minibatches)(counters, state, ring, real_ratio, key)
     real = np.asarray(batches.reward) == 1.0
     assert set(np.unique(batches.reward)) <= {1.0, 2.0}
     assert scipy.stats.binomtest(int(real.sum()), real.size, real_ratio).pvalue > 1e-3
