@@ -50,6 +50,17 @@ def trained(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def short_run(tmp_path_factory):
+    """A finished run by the host's driver of this process: its settings."""
+    from tests.helpers import tiny
+    from vecpsmbpo import training
+
+    settings = tiny(env="ball_in_cup", backend="host", run_dir=tmp_path_factory.mktemp("short") / "run")
+    assert training.train(settings) == 0
+    return settings
+
+
+@pytest.fixture(scope="session")
 def policy(trained):
     """The best policy of its second seed, exported."""
     from vecpsmbpo import cli
@@ -69,6 +80,7 @@ LONGEST = (
     "test_cli",
     "test_health",
     "test_damage",
+    "test_interrupted",
     "test_adapters",
     "test_members",
     "test_export",

@@ -121,6 +121,11 @@ def final_parameters(run_dir: Path) -> list[np.ndarray]:
     return [np.asarray(jax.random.key_data(leaf) if is_key(leaf) else leaf) for leaf in leaves]
 
 
+def files_of(folder: Path) -> dict[str, bytes]:
+    """What each file below a folder holds."""
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def assert_same_run(run_dir: Path, other: Path) -> None:
     for ours, theirs in zip(final_parameters(run_dir), final_parameters(other), strict=True):
         np.testing.assert_array_equal(ours, theirs)

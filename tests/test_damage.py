@@ -5,9 +5,7 @@ import dataclasses
 import errno
 import json
 import os
-import re
 import shutil
-import signal
 import types
 from pathlib import Path
 
@@ -16,32 +14,13 @@ import numpy as np
 import pytest
 
 import vecpsmbpo
-from tests.helpers import (
-    assert_same_run,
-    check_log,
-    command,
-    tiny,
-)
+from tests.helpers import check_log, command, files_of, tiny
 from tools.harm.runs import NotTried
 from tools.harm.scarce import mounted
-from vecpsmbpo import checkpoint, cli, config, evaluate, jsonl, metrics, placement, recorded, training
-from vecpsmbpo.drivers.host import HostDriver
-from vecpsmbpo.envs.host.batched import SimulatorError
-from vecpsmbpo.envs.host.dm_control import DmControlSimulator
+from vecpsmbpo import checkpoint, config, evaluate, jsonl, metrics, placement, recorded, training
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.stopping import Stop
 from vecpsmbpo.training import guards
-from vecpsmbpo.training.loop import _Session
 from vecpsmbpo.types import Hyper
-
-
-@pytest.fixture(scope="module")
-def short_run(tmp_path_factory):
-    """A finished host run of this process, and its settings."""
-    folder = tmp_path_factory.mktemp("short")
-    settings = tiny(env="ball_in_cup", backend="host", run_dir=folder / "run")
-    assert training.train(settings) == 0
-    return settings
 
 
 @pytest.mark.parametrize("posterior", ["sample", "average"])
@@ -81,18 +60,14 @@ def _damage(run_dir: Path, step: int) -> None:
             file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
 
-def _files(run_dir: Path) -> dict[str, bytes]:
-    return {str(path): path.read_bytes() for path in run_dir.rglob("*") if path.is_file()}
-
-
 def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(short_run, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(short_run.run_dir, folder)
     settings = dataclasses.replace(short_run, run_dir=str(folder))
     _damage(folder, 120)
-    before = _files(folder)
+    before = files_of(folder)
     assert evaluate.restore(settings)[1].step == 80
-    assert _files(folder) == before  # looking at a run changes nothing
+    assert files_of(folder) == before  # looking at a run changes nothing
     assert training.train(settings) == 0
     printed = capsys.readouterr()
     assert "the checkpoint at step 120 is damaged; taking the one before it" in printed.err
@@ -107,12 +82,12 @@ def test_a_run_whose_checkpoints_are_all_damaged_is_left_as_it_is(short_run, tmp
     shutil.copytree(short_run.run_dir, folder)
     _damage(folder, 120)
     _damage(folder, 80)
-    before = _files(folder)
+    before = files_of(folder)
     result = command("train", f"run_dir={folder}", cwd=tmp_path)
     assert result.returncode == 2
     (said,) = result.stderr.splitlines()
     assert said.startswith(f"vecpsmbpo: {folder}/checkpoints: holds checkpoints, but none that can be read (")
-    assert _files(folder) == before
+    assert files_of(folder) == before
 
 
 def _flip(path: Path, at: float = 0.5, bit: int = 4) -> None:
@@ -174,10 +149,10 @@ def test_settings_that_are_not_the_checkpoints_are_refused_and_nothing_changes(c
     folder = tmp_path / "run"
     shutil.copytree(short_run.run_dir, folder)
     (folder / "config.yaml").unlink()
-    before = _files(folder)
+    before = files_of(folder)
     with pytest.raises(SettingError, match=expected):
         training.train(dataclasses.replace(short_run, run_dir=str(folder), **changes))
-    assert _files(folder) == before
+    assert files_of(folder) == before
     if changes == {"seed": 5}:
         assert training.train(dataclasses.replace(short_run, run_dir=str(folder))) == 0  # the right ones
         assert dataclasses.replace(config.load(folder), run_dir=short_run.run_dir) == short_run
@@ -187,10 +162,10 @@ def test_a_run_whose_checkpoints_are_gone_does_not_begin_anew(short_run, tmp_pat
     folder = tmp_path / "run"
     shutil.copytree(short_run.run_dir, folder)
     shutil.rmtree(folder / "checkpoints")
-    before = _files(folder)
+    before = files_of(folder)
     with pytest.raises(SettingError, match="its logs reach step 120, but its checkpoints are gone"):
         training.train(dataclasses.replace(short_run, run_dir=str(folder)))
-    assert _files(folder) == before
+    assert files_of(folder) == before
     assert not (folder / "checkpoints").exists()
 
 
@@ -208,141 +183,6 @@ def test_what_is_wrong_with_the_logs_is_said_when_a_run_goes_on(short_run, tmp_p
     assert f"{episodes_file}: 1 line(s) that cannot be read, set aside in episodes.jsonl.strange" in said  # cut in half
     assert "of its lines up to step 120 are lost" in said
     assert said.count("\n") == 3
-
-
-def test_a_simulator_that_fails_costs_its_stride_and_no_more(short_run, tmp_path, monkeypatch, capsys):
-    """One line, the state before the stride is saved, and the mended task goes on to the same end."""
-    settings, step = dataclasses.replace(short_run, run_dir=str(tmp_path / "a b=c")), DmControlSimulator.step
-    left = [66]  # steps, those of an evaluation included
-
-    def breaks(self, action):
-        left[0] -= 1
-        if left[0] < 0:
-            raise SystemExit(0)  # what would end the program as if all were well
-        return step(self, action)
-
-    monkeypatch.setattr(DmControlSimulator, "step", breaks)
-    assert cli._run(settings) == (1, True)
-    monkeypatch.undo()
-    said = capsys.readouterr()
-    saved = evaluate.restore(settings)[1].step
-    assert 0 < saved < 66
-    assert re.fullmatch(
-        rf"vecpsmbpo: ball_in_cup failed at step \d+: SystemExit: 0 at .*; saved at step {saved}; to continue: .*\n",
-        said.err,
-    )
-    assert said.err.rstrip().endswith(
-        """to continue: vecpsmbpo train 'run_dir='"'"'""" + str(tmp_path) + """/a b=c'"'"''"""
-    )
-    assert "Traceback" not in said.out + said.err
-    assert training.train(settings) == 0
-    assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
-
-
-@pytest.mark.parametrize("failing", [80, 120])
-def test_a_simulator_that_fails_in_an_evaluation_costs_no_training(failing, short_run, tmp_path, monkeypatch, capsys):
-    """Of all that was trained since the last checkpoint nothing is lost, and the evaluation is made up for, though the
-    run that did so was killed before it saved anything."""
-    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"), checkpoint_every=5)
-    evaluated = HostDriver.evaluate
-
-    def fails(driver, state, *args):
-        if int(state.counters.env_steps) == failing:
-            raise SimulatorError("out of coal")
-        return evaluated(driver, state, *args)
-
-    monkeypatch.setattr(HostDriver, "evaluate", fails)
-    for _ in range(2):
-        said = f"failed in the evaluation at step {failing}: out of coal; saved at step {failing}; to continue"
-        with pytest.raises(training.TaskFailed, match=said):
-            training.train(settings)
-        assert jsonl.read(tmp_path / "run" / "metrics.jsonl")[-1]["env_steps"] == failing - 40
-    monkeypatch.undo()
-    if failing < settings.total_steps:
-        monkeypatch.setattr(_Session, "_chunk", os.kill)  # which wants arguments: an end without a save
-        with pytest.raises(TypeError):
-            training.train(settings)
-        monkeypatch.undo()
-    assert training.train(settings) == 0
-    assert capsys.readouterr().err == ""
-    assert_same_run(Path(settings.run_dir), Path(short_run.run_dir))
-
-
-@pytest.mark.parametrize("stopped_at", [40, 120])
-def test_a_signal_in_an_evaluation_is_heeded(stopped_at, short_run, tmp_path, monkeypatch, capsys):
-    """Nothing of what was trained is lost, and the evaluation is made up for; also the last one."""
-    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"), checkpoint_every=5)
-    evaluated, stop = HostDriver.evaluate, Stop()
-
-    def signalled(driver, state, *args):
-        if int(state.counters.env_steps) == stopped_at:
-            stop.requested = signal.SIGTERM
-        return evaluated(driver, state, *args)
-
-    monkeypatch.setattr(HostDriver, "evaluate", signalled)
-    assert training.train(settings, stop) == 128 + signal.SIGTERM
-    assert "to continue: vecpsmbpo train" in capsys.readouterr().out
-    assert evaluate.restore(settings)[1].step == stopped_at
-    assert all(line["env_steps"] < stopped_at for line in jsonl.read(tmp_path / "run" / "metrics.jsonl"))
-    monkeypatch.undo()
-    assert training.train(settings) == 0
-    _assert_done(settings, short_run, capsys)
-
-
-def test_a_save_in_the_last_evaluation_is_made_whole_when_it_is_over(short_run, tmp_path, monkeypatch, capsys):
-    """What Slurm's SIGTERM asks for: to save, and to go on."""
-    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
-    evaluated, stop = HostDriver.evaluate, Stop()
-
-    def signalled(driver, state, *args):
-        stop.save = int(state.counters.env_steps) == settings.total_steps
-        return evaluated(driver, state, *args)
-
-    monkeypatch.setattr(HostDriver, "evaluate", signalled)
-    assert training.train(settings, stop) == 0
-    _assert_done(settings, short_run, capsys)
-
-
-def _assert_done(settings, reference, capsys):
-    """It is what the undisturbed run is, and knows that it is complete."""
-    assert_same_run(Path(settings.run_dir), Path(reference.run_dir))
-    capsys.readouterr()
-    before = {name: content for name, content in _files(Path(settings.run_dir)).items() if "tensorboard" not in name}
-    assert training.train(settings) == 0
-    said = capsys.readouterr()
-    assert "already complete at" in said.out
-    assert said.err == ""
-    assert _files(Path(settings.run_dir)).items() >= before.items()
-
-
-@pytest.mark.parametrize("begun", [False, True])
-def test_a_simulator_that_fails_at_its_first_reset_leaves_all_as_it_was(
-    begun, short_run, tmp_path, monkeypatch, capsys
-):
-    """Of a new run, and of one that is gone on with."""
-    settings = dataclasses.replace(short_run, run_dir=str(tmp_path / "run"))
-    if begun:
-        shutil.copytree(short_run.run_dir, tmp_path / "run")
-    before = _files(tmp_path)
-
-    def fails(*_):
-        raise ValueError("no coal")
-
-    monkeypatch.setattr(DmControlSimulator, "load" if begun else "reset", fails)
-    line = r"^ball_in_cup failed before its first step: ValueError: no coal at \S+; nothing has been changed$"
-    with pytest.raises(training.TaskFailed, match=line):
-        training.train(settings)
-    assert capsys.readouterr().err == ""
-    assert _files(tmp_path) == before
-    assert begun or not list(tmp_path.iterdir())
-
-
-def test_a_task_that_cannot_be_made_again_has_failed_in_the_evaluation():
-    def fails(**_):
-        raise SettingError("env=mine: cannot be made")
-
-    with pytest.raises(SimulatorError, match="env=mine: cannot be made"):
-        HostDriver._others(types.SimpleNamespace(_make_env=fails), 1, 0)
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(short_run):
