@@ -1,10 +1,11 @@
-"""Simulators on the host: the functions of the algorithm, jitted one by one, with a simulator stepped between them."""
+"""Simulators on the host: the program of `drivers/scan.py` cut where a simulator is stepped, so that two programs meet
+at a step: what follows it and the action of the next one are one call, with one array in and one out."""
 
 import itertools
 import zlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,13 +29,30 @@ from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
 from vecpsmbpo.layout import BY_SEED, SHARED
 from vecpsmbpo.schedule import begin_stride, observe_and_learn, over_seeds, split_keys
 from vecpsmbpo.settings import SettingError, Settings
-from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, SeedState, TrainState, Transition
+from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, TrainState, Transition
 
 T = TypeVar("T")
 
 
+class Acted(NamedTuple):
+    """An action in every seed's environment, and what acting has changed, which is kept beside the state until the step
+    is observed: acting needs no copy of the state.
+
+    Attributes:
+        action: [S, A].
+        memory: of the algorithm, leaves [S, ...].
+        key: [S] the seeds' own from now on.
+        keys: [S, 2] to observe and to learn with.
+    """
+
+    action: jax.Array
+    memory: Any
+    key: jax.Array
+    keys: jax.Array
+
+
 class HostDriver:
-    """The same functions, jitted one by one, with a simulator stepped between them."""
+    """The same functions, jitted in parts, with a simulator stepped between them."""
 
     def __init__(self, algorithm: Algorithm, env: HostEnv, make_env: Callable[..., HostEnv]):
         """
@@ -49,15 +67,14 @@ class HostDriver:
         self._make_env = make_env
         self._env = env
         self._env.episode_length = self.settings.training_limit
-        specs, seeds = self.layout.specs(), self.layout.specs().seeds
+        specs = self.layout.specs()
         jit, before = self.layout.jit_shard_map, specs.without_rings()
         self._init = jit(self._init_local, (BY_SEED,) * 3, specs, compiler_options=COMPILED_QUICKLY)
-        self._begin = jit(self._begin_local, (specs,), (before, specs, SHARED), donate_argnums=0)
-        self._act = jit(self._act_local, (specs.counters, seeds, BY_SEED), (BY_SEED,) * 4)
-        self._observe = jit(
-            self._observe_local,
-            (specs, *(BY_SEED,) * 6, SHARED),
-            (specs, BY_SEED),
+        self._begin = jit(self._begin_local, (specs,), (before, specs, SHARED, BY_SEED), donate_argnums=0)
+        self._follow = jit(
+            self._follow_local,
+            (specs, BY_SEED, BY_SEED, SHARED),
+            (specs, BY_SEED, BY_SEED),
             donate_argnums=0,
         )
         self._settle = jit(partial(health.settle, self.layout), (before, specs), (specs, BY_SEED), donate_argnums=1)
@@ -85,35 +102,32 @@ class HostDriver:
 
     def compile(self, state: TrainState) -> None:
         spec, seeds, episodes = self.algorithm.spec, self.layout.num_lanes, self.settings.eval_episodes
-        obs, number = self._shape(spec.obs_size), self._shape()
-        action, memory, key, keys = jax.eval_shape(self._act, state.counters, state.seeds, obs)
-        before, _, learning = jax.eval_shape(self._begin, state)
-        transition, flag = Transition(obs, action, number, obs, number), jax.ShapeDtypeStruct((seeds,), bool)
+        before, _, learning, acted = jax.eval_shape(self._begin, state)
+        stepped = self._shape(3 + 2 * spec.obs_size)
         episode_keys = jax.eval_shape(lambda key: split_for_episodes(key, episodes).actions, state.seeds.key)
         policies = jax.eval_shape(self._policies, state.seeds, state.seeds.key)
         remembered = jax.eval_shape(lambda: broadcast_leaves(self.algorithm.memory(), seeds, episodes))
         states = self._shape(episodes, spec.obs_size)
         programs = [
             (self._begin, (state,)),
-            (self._act, (state.counters, state.seeds, obs)),
-            (self._observe, (state, memory, transition, flag, key, keys, obs, learning)),
+            (self._follow, (state, acted, stepped, learning)),
             (self._settle, (before, state)),
             (self._policies, (state.seeds, state.seeds.key)),
             (self._evaluation_actions, (policies, jnp.int32(0), remembered, states, episode_keys)),
         ]
         executables, self.compile_seconds = compiled(programs)
-        self._begin, self._act, self._observe, self._settle, self._policies, actions = executables
+        self._begin, self._follow, self._settle, self._policies, actions = executables
         self._compiled_evaluation_actions = actions
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
         news: list[EpisodeEnd] = []
         for _ in range(strides):
             self._saved_env = self._env.save()
-            before, state, learning = self._begin(state)
+            before, state, learning, acted = self._begin(state)
             ends: list[EpisodeEnd] = []
             try:
                 for _ in range(self.settings.stride):
-                    state, end = self._step(state, learning)
+                    state, end, acted = self._follow(state, acted, self._step(acted.action), learning)
                     ends.append(end)
             except SimulatorError as error:
                 # Rows that were written to the rings lie beyond the counters, and will be written again.
@@ -140,15 +154,11 @@ class HostDriver:
                 "depend on more than their seeds and actions"
             )
 
-    def _step(self, state: TrainState, learning: jax.Array) -> tuple[TrainState, EpisodeEnd]:
-        obs = state.env
-        action, memory, key, keys = self._act(state.counters, state.seeds, obs)
+    def _step(self, action: jax.Array) -> jax.Array:
+        """Steps all simulators: [S, 3 + 2 O], as `_follow_local` takes it apart."""
         step = _in_all(partial(self._env.step, np.asarray(processes.here(action))))
-        seen = (step.reward, step.next_obs, step.terminated.astype(np.float32), step.truncated, step.obs)
-        reward, next_obs, terminated, truncated, following = self.layout.everywhere(seen, BY_SEED)
-        transition = Transition(obs, action, reward, next_obs, terminated)
-        state, end = self._observe(state, memory, transition, truncated, key, keys, following, learning)
-        return state, end
+        columns = (step.reward, step.terminated, step.truncated, step.next_obs, step.obs)
+        return self.layout.everywhere(np.column_stack(columns).astype(np.float32), BY_SEED)
 
     def evaluate(
         self, state: TrainState, keys: jax.Array, episodes: int, stopping: Callable[[], bool] = never
@@ -206,30 +216,35 @@ class HostDriver:
         counters = Counters(env_steps=jnp.int32(0), imagined_rows=jnp.int32(0))
         return TrainState(counters, jax.vmap(self.algorithm.init)(keys, hyper), obs)
 
-    def _begin_local(self, state: TrainState) -> tuple[TrainState, TrainState, jax.Array]:
-        return state.without_rings(), *begin_stride(self.algorithm, state)
+    def _begin_local(self, state: TrainState) -> tuple[TrainState, TrainState, jax.Array, Acted]:
+        begun, learning = begin_stride(self.algorithm, state)
+        return state.without_rings(), begun, learning, self._act(begun)
 
-    def _act_local(self, counters: Counters, seeds: SeedState, obs: jax.Array) -> tuple[jax.Array, ...]:
-        # What acting changes, memory and key, goes to `_observe_local` beside the state: acting needs no copy of it.
-        advanced, keys = split_keys(seeds, 3)
-        return *over_seeds(self.algorithm.act)(counters, seeds, obs, keys[:, 0]), advanced.key, keys[:, 1:]
+    def _act(self, state: TrainState) -> Acted:
+        advanced, keys = split_keys(state.seeds, 3)
+        action, memory = over_seeds(self.algorithm.act)(state.counters, state.seeds, state.env, keys[:, 0])
+        return Acted(action, memory, advanced.key, keys[:, 1:])
 
-    def _observe_local(
-        self,
-        state: TrainState,
-        memory: Any,
-        transition: Transition,
-        truncated: jax.Array,
-        key: jax.Array,
-        keys: jax.Array,
-        obs: jax.Array,
-        learning: jax.Array,
-    ) -> tuple[TrainState, EpisodeEnd]:
-        seeds = state.seeds.replace(memory=memory, key=key)
+    def _follow_local(
+        self, state: TrainState, acted: Acted, stepped: jax.Array, learning: jax.Array
+    ) -> tuple[TrainState, EpisodeEnd, Acted]:
+        """What follows a step of the simulators, and the next action where the stride goes on: another one begins with
+        an action of its own."""
+        reward, terminated, truncated = jnp.moveaxis(stepped[:, :3], 1, 0)
+        next_obs, obs = jnp.split(stepped[:, 3:], 2, axis=1)
+        transition = Transition(state.env, acted.action, reward, next_obs, terminated)
         counters, seeds, end = observe_and_learn(
-            self.algorithm, state.counters, seeds, transition, truncated, keys, learning
+            self.algorithm,
+            state.counters,
+            state.seeds.replace(memory=acted.memory, key=acted.key),
+            transition,
+            truncated > 0,
+            acted.keys,
+            learning,
         )
-        return TrainState(counters, seeds, obs), end
+        state = TrainState(counters, seeds, obs)
+        goes_on = counters.env_steps % self.settings.stride != 0
+        return state, end, jax.lax.cond(goes_on, self._act, lambda _: acted, state)
 
 
 def _in_all(call: Callable[[], T]) -> T:
