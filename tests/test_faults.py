@@ -247,12 +247,27 @@ def test_control_c_is_not_lost_in_an_import(module, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("words", [["--version"], ["--help"]])
+def test_a_reader_that_has_read_enough_is_no_mistake(words, monkeypatch, capsys):
+    """`vecpsmbpo --help | head`, also where all fits into the buffer and is written when the program ends."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    unheard: list[str] = []
+    monkeypatch.setattr(stopping, "speak_to_nobody", lambda: unheard.append("gone"))
+    pipe = open(writing, "w")  # noqa: SIM115: closing it fails, too
+    monkeypatch.setattr("sys.stdout", pipe)
+    assert (cli.main(words), unheard) == (141, ["gone"])
+    assert capsys.readouterr().err == ""
+    with contextlib.suppress(BrokenPipeError):
+        pipe.close()
+
+
 def test_a_reader_that_is_gone_does_not_stop_what_is_printed_to_it(monkeypatch):
     """`vecpsmbpo train | head`, and a terminal that was closed."""
     reading, writing = os.pipe()
     os.close(reading)
     unheard: list[str] = []
-    monkeypatch.setattr(stopping, "_speak_to_nobody", lambda: unheard.append("gone"))
+    monkeypatch.setattr(stopping, "speak_to_nobody", lambda: unheard.append("gone"))
     with open(writing, "w", buffering=1) as pipe:
         console = Console(file=stopping.Outliving(pipe))
         console.print("a line")

@@ -10,7 +10,8 @@
     python tools/bench.py hosted      what a step around a host simulator costs besides simulating and learning
     python tools/bench.py compare     one policy of MBPO, here and in mbrl-lib (benches/peer.py says what it needs)
 
-Further arguments are settings, as for `vecpsmbpo train` (of `envs`: tasks). One line of JSON per measurement.
+Further arguments are settings, as for `vecpsmbpo train` (of `envs`: tasks). One line of JSON per measurement, when it
+is made, with what was measured and on what machine.
 """
 
 import json
@@ -22,6 +23,7 @@ import jax
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from tools import provenance
 from tools.benches import epoch, peer, pieces, program, simulators
 from vecpsmbpo.settings import SettingError
 
@@ -53,8 +55,8 @@ if __name__ == "__main__":
         print(f"bench: takes one of {', '.join(BENCHES)}, then settings", file=sys.stderr)
         sys.exit(2)
     results = BENCHES[sys.argv[1]]()
-    machine = {"bench": sys.argv[1]}
+    machine = {"bench": sys.argv[1], **provenance.everything()}
     if sys.argv[1] != "compare":  # which leaves the devices to the programs that it starts
         machine |= {"devices": jax.device_count(), "platform": jax.default_backend()}
-    for result in results if isinstance(results, list) else [results]:
-        print(json.dumps({**machine, **result}))
+    for result in [results] if isinstance(results, dict) else results:
+        print(json.dumps({**machine, **result}), flush=True)

@@ -31,8 +31,6 @@ Parts:
 """
 
 import csv
-import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -40,6 +38,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from tools import provenance
 from tools.harm.careless import careless
 from tools.harm.ends import kills, signals, twice
 from tools.harm.files import files
@@ -47,11 +46,10 @@ from tools.harm.runs import FINE, NotTried
 from tools.harm.scarce import disk, limits
 from tools.harm.simulators import simulators
 from tools.harm.writes import writes
-from vecpsmbpo import arguments, versions
+from vecpsmbpo import arguments
 from vecpsmbpo.settings import SettingError
 
 OUT = Path("results/faults.csv")
-TRIED = ("configs", "envs", "hydra_plugins", "tools", "vecpsmbpo")
 PARTS = {part.__name__: part for part in (careless, simulators, files, signals, twice, writes, disk, kills, limits)}
 
 
@@ -75,7 +73,7 @@ def main(words: Sequence[str]) -> int:
     for name in (*alone, *(set(options["part"]) - set(PARTS))):
         raise SettingError(f"{name}: no such part; part={','.join(PARTS)}")
     which, of = map(int, options["portion"].split("/"))
-    tried_on, all_fine = _code(), True
+    tried_on, all_fine = provenance.code(), True
     for name in options["part"]:
         with tempfile.TemporaryDirectory() as folder:
             try:
@@ -108,19 +106,6 @@ def keep(part: str, names: Sequence[str], row: dict[str, str]) -> None:
         writer = csv.DictWriter(file, ["part", "what", "ended", "commit", "versions"], lineterminator="\n")
         writer.writeheader()
         writer.writerows(kept)
-
-
-def _code() -> dict[str, str]:
-    """What is tried: a commit, and versions of what it runs on."""
-
-    def git(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(["git", *words], capture_output=True, text=True, check=False)
-
-    commit = "unknown"
-    if shutil.which("git") and (found := git("rev-parse", "--short", "HEAD")).returncode == 0:
-        changed = git("diff", "--quiet", "HEAD", "--", *TRIED).returncode
-        commit = found.stdout.strip() + "+" * changed
-    return {"commit": commit, "versions": versions.line()}
 
 
 if __name__ == "__main__":

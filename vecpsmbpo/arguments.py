@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from vecpsmbpo import stopping
 from vecpsmbpo.config import CONFIG_FILE, closest
 from vecpsmbpo.settings import SettingError
 
@@ -142,11 +143,14 @@ def as_tool(name: str, main: Callable[[Sequence[str]], int], about: str | None, 
     """Runs a program of `tools/` as `vecpsmbpo` runs a command: with `--help`, and one line for a mistake; its exit
     status."""
     words = sys.argv[1:]
-    if {"-h", "--help"} & set(words):
-        print(explain(name, about or "", options))
-        return 0
     try:
+        if {"-h", "--help"} & set(words):
+            print(explain(name, about or "", options), flush=True)
+            return 0
         return main(words)
+    except BrokenPipeError:
+        stopping.speak_to_nobody()
+        return stopping.UNHEARD
     except SettingError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2

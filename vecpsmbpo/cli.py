@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
-from vecpsmbpo import crash, interrupt, limits, words
+from vecpsmbpo import crash, interrupt, limits, stopping, words
 from vecpsmbpo.settings import SettingError, Settings
 
 HELP = """\
@@ -55,7 +55,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? for one
     try:
-        return _dispatch(arguments)
+        status = _dispatch(arguments)
+        print(end="", flush=True)
+        return status
+    except BrokenPipeError:  # of `| head`, which has read enough
+        stopping.speak_to_nobody()
+        return stopping.UNHEARD
     except SettingError as error:
         words.complain(error)
         return 2

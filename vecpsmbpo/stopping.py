@@ -11,6 +11,7 @@ from types import FrameType
 from typing import Any, TextIO
 
 Handler = Callable[[int, FrameType | None], Any]
+UNHEARD = 128 + getattr(signal, "SIGPIPE", 13)  # the exit status of a program whose reader has gone
 FINISHING = "finishing this chunk and saving; once more to stop at once"
 
 
@@ -115,10 +116,10 @@ def _unheard() -> Iterator[None]:
     try:
         yield
     except OSError:
-        _speak_to_nobody()
+        speak_to_nobody()
 
 
-def _speak_to_nobody() -> None:
+def speak_to_nobody() -> None:
     """Whatever is printed from now on is lost."""
     nobody = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):

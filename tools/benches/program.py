@@ -93,14 +93,16 @@ def bench_updates() -> dict[str, Any]:
     driver = driver_of([*PAPER, "updates_per_step=10", "replay_capacity=20000", "imagined_capacity=20480"])
     settings, spec = driver.settings, driver.algorithm.spec
     state = driver.init(*initial_inputs(settings))
-    peaks = [matmul_peak()]
+    peaks = [matmul_peak(settings.network_precision)]
     seconds = seconds_per_update(driver, state, 3) / settings.updates_per_step
-    peaks.append(matmul_peak())
+    peaks.append(matmul_peak(settings.network_precision))
     rate = settings.n_members * update_flops(settings, spec.obs_size, spec.action_size) / seconds
     return {
         "members": settings.n_members,
         "width": settings.policy_hidden_size,
         "batch": settings.policy_batch_size,
+        "critic_norm": settings.critic_norm,
+        "precision": settings.network_precision,
         "ms_per_update_of_all_members": 1e3 * seconds,
         "member_updates_per_s": settings.n_members / seconds,
         "gflops": rate / 1e9,

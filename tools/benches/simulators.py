@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -16,18 +17,15 @@ from vecpsmbpo.envs import registry
 from vecpsmbpo.programs import initial_inputs, make_driver
 
 
-def bench_envs() -> list[dict[str, Any]]:
+def bench_envs() -> Iterator[dict[str, Any]]:
     """Every task (or those named) on every backend that it has; actions are uniform."""
-    found = []
     for backend in ("mjx", "host"):
         for name in registry.names(backend):
             if sys.argv[2:] and name not in sys.argv[2:]:
                 continue
             for batch in (1, 10, 100):
                 measure = mjx_steps if backend == "mjx" else host_steps
-                found.append({"env": name, "backend": backend, "batch": batch, **measure(name, batch)})
-                print(found[-1], file=sys.stderr, flush=True)
-    return found
+                yield {"env": name, "backend": backend, "batch": batch, **measure(name, batch)}
 
 
 def mjx_steps(name: str, batch: int, **options: Any) -> dict[str, float]:
@@ -64,10 +62,9 @@ def host_steps(name: str, batch: int) -> dict[str, float]:
     return {"steps_per_s": batch * steps / best_seconds(run, 3)}
 
 
-def bench_host() -> list[dict[str, Any]]:
+def bench_host() -> Iterator[dict[str, Any]]:
     """Steps per second of a batch of simulators: one after the other (as `HostEnv` does it), each handed to a pool of
     threads or to a process of its own (Gymnasium's `AsyncVectorEnv`, which has Gymnasium's tasks only)."""
-    found = []
     for name in sys.argv[2:] or ("hopper", "ball_in_cup", "window_open"):
         for batch in (2, 10, 100):
             env, steps = envs.make(name, "host", num_envs=batch), 50
@@ -90,8 +87,7 @@ def bench_host() -> list[dict[str, Any]]:
                 processes = best_seconds(lambda v=vector, a=actions: [v.step(x.astype("float32")) for x in a], 5)
                 vector.close()
                 row["processes_steps_per_s"] = batch * steps / processes
-            found.append(row)
-    return found
+            yield row
 
 
 def bench_hosted() -> dict[str, Any]:
