@@ -254,12 +254,11 @@ def test_a_reader_that_has_read_enough_is_no_mistake(words, monkeypatch, capsys)
     os.close(reading)
     unheard: list[str] = []
     monkeypatch.setattr(stopping, "speak_to_nobody", lambda: unheard.append("gone"))
-    pipe = open(writing, "w")  # noqa: SIM115: closing it fails, too
-    monkeypatch.setattr("sys.stdout", pipe)
-    assert (cli.main(words), unheard) == (141, ["gone"])
+    with contextlib.suppress(BrokenPipeError), open(writing, "w") as pipe:  # closing it fails, too
+        monkeypatch.setattr("sys.stdout", pipe)
+        status = cli.main(words)
+    assert (status, unheard) == (141, ["gone"])
     assert capsys.readouterr().err == ""
-    with contextlib.suppress(BrokenPipeError):
-        pipe.close()
 
 
 def test_a_reader_that_is_gone_does_not_stop_what_is_printed_to_it(monkeypatch):

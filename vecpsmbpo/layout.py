@@ -116,7 +116,8 @@ class Layout:
 
         Where they run one after the other, so do the seeds that this is then batched over: XLA adds along the rows of
         [256, 64] four times as fast as along those of [1, 256, 64], and a fit that has stopped need not wait for the
-        fits of other seeds.
+        fits of other seeds. All of them in one loop: of two, one in the other, each would take every leaf apart and put
+        it together again, which is a fifth of what XLA has to compile.
 
         Args:
             batched: leaves [N_local, ...] or [P_local, ...].
@@ -125,9 +126,24 @@ class Layout:
         if not self.sequential:
             return jax.vmap(lambda *one: function(*one, *shared))(*batched)
 
-        @jax.custom_batching.sequential_vmap
+        @jax.custom_batching.custom_vmap
         def loop(batched: Any, shared: Any) -> Any:
             return jax.lax.map(lambda one: function(*one, *shared), batched)
+
+        @loop.def_vmap
+        def loop_over_seeds(seeds: int, of_seeds: Any, batched: Any, shared: Any) -> Any:
+            """Leaves of `batched` [S, P_local, ...], and of `shared` [S, ...], but for those that all seeds share."""
+            batched = jax.tree.map(lambda x, own: x if own else jnp.stack([x] * seeds), batched, of_seeds[0])
+            each = jax.tree.leaves(batched)[0].shape[1]
+
+            def run(index: jax.Array, one: Any) -> Any:
+                seed = index // each if seeds > 1 else 0
+                return function(*one, *jax.tree.map(lambda x, own: x[seed] if own else x, shared, of_seeds[1]))
+
+            flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batched)
+            found = jax.lax.map(lambda xs: run(*xs), (jnp.arange(seeds * each), flat))
+            found = jax.tree.map(lambda x: x.reshape(seeds, each, *x.shape[1:]), found)
+            return found, jax.tree.map(lambda _: True, found)
 
         return loop(batched, shared)
 
