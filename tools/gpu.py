@@ -170,13 +170,15 @@ def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     if tool == "parity.py":
         words.append(f"output={table}")
     command = [sys.executable, str(HERE / tool), *words]
+    limit = None if tiny else seconds
     try:
-        done = subprocess.run(command, stdout=subprocess.PIPE, timeout=seconds, text=True, check=False)
-    except subprocess.TimeoutExpired:
-        return f"FAILED: took longer than {seconds:.0f} s"
+        done = subprocess.run(command, stdout=subprocess.PIPE, timeout=limit, check=False)
+    except subprocess.TimeoutExpired as cut:
+        keep(part, out, command, {"found": _measured(cut.stdout)}, ending="_cut")
+        return f"FAILED: took longer than {seconds:.0f} s; {part.name}_cut.json has what was measured until then"
     if done.returncode:
         return f"FAILED with status {done.returncode}"
-    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    found = _measured(done.stdout)
     if tool == "parity.py":
         with table.open() as file:
             found = list(csv.DictReader(file))
@@ -184,10 +186,16 @@ def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     return f"{len(found)} lines"
 
 
-def keep(part: Part, out: Path, command: list[str], found: dict[str, Any]) -> None:
+def _measured(printed: bytes | None) -> list[dict[str, Any]]:
+    """The lines of a tool that are whole and have figures."""
+    lines = (printed or b"").decode().splitlines()
+    return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
+
+
+def keep(part: Part, out: Path, command: list[str], found: dict[str, Any], ending: str = "") -> None:
     """Writes a part's file."""
     about = {"command": " ".join(["python", *command[1:]]), **provenance.everything(), "device": device()}
-    (out / f"{part.name}.json").write_text(json.dumps({**about, **found}, indent=1) + "\n")
+    (out / f"{part.name}{ending}.json").write_text(json.dumps({**about, **found}, indent=1) + "\n")
 
 
 @functools.cache
