@@ -73,6 +73,15 @@ def trained(request):
     return settings, driver, terminates, state, news
 
 
+def test_every_step_has_an_action_of_its_own(trained):
+    """Within a stride, and from one to the next: of random actions no two are the same."""
+    settings, driver, _, state, _ = trained
+    spec = driver.algorithm.spec
+    for real in state.seeds.real[:, : settings.warmup_steps]:
+        action = np.asarray(replay.unpack(real, spec.obs_size, spec.action_size).action)
+        assert len(np.unique(action, axis=0)) == settings.warmup_steps
+
+
 def test_q_is_the_known_value_function(trained):
     """Q(s, π(s)) = V(s) for every member; at actions that no policy takes, Q is extrapolation."""
     settings, driver, terminates, state, _ = trained

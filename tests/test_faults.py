@@ -1,6 +1,7 @@
 """What careless commands and surroundings do: one line each. In this process, where nothing has to start."""
 
 import contextlib
+import errno
 import importlib.util
 import io
 import os
@@ -259,6 +260,17 @@ def test_a_reader_that_has_read_enough_is_no_mistake(words, monkeypatch, capsys)
         status = cli.main(words)
     assert (status, unheard) == (141, ["gone"])
     assert capsys.readouterr().err == ""
+
+
+def test_another_pipe_that_breaks_is_said(monkeypatch, capsys):
+    """Of a logger's service, for example, while somebody reads what is printed."""
+
+    def breaks(arguments):
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+    monkeypatch.setattr(cli, "_dispatch", breaks)
+    assert cli.main(["envs"]) == 2
+    assert capsys.readouterr().err == "vecpsmbpo: Broken pipe\n"
 
 
 def test_a_reader_that_is_gone_does_not_stop_what_is_printed_to_it(monkeypatch):

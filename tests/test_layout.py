@@ -76,6 +76,28 @@ def test_seeds_in_one_program_equal_seeds_alone(reference):
     _close(jax.tree.map(lambda x: x[1:], together.agents), learned(second, Layout.of(second)).agents)
 
 
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_what_runs_in_turns_has_what_is_its_own(seeds):
+    """Seeds batched around the loop over members, on one device: each has its own data, or what all of them share."""
+    layout = Layout.of(tiny(n_models=3, n_policies=1, devices=1))
+    own = jax.random.normal(jax.random.key(0), (seeds, 3, 4))
+    keys = jax.random.split(jax.random.key(1), (seeds, 3))
+    data, weights, common = jnp.arange(10.0).reshape(2, 5)[:seeds], jnp.arange(3.0), jnp.float32(0.5)
+
+    def function(x, key, weight, data, nothing, common):
+        assert nothing is None
+        return x * weight + data.sum() + common, jax.random.normal(key)
+
+    def of_seed(x, keys, data):
+        return layout.map_local(function, x, keys, weights, shared=(data, None, common))
+
+    assert layout.sequential
+    found, drawn = jax.jit(jax.vmap(of_seed))(own, keys, data)
+    expected = own * weights[:, None] + data.sum(axis=1)[:, None, None] + common
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    np.testing.assert_array_equal(drawn, jax.vmap(jax.vmap(jax.random.normal))(keys))
+
+
 def test_a_member_learns_as_a_single_agent_would(reference):
     """The program's member 1 equals `sac.updates` called by hand on the minibatches that it drew."""
     settings, looped = reference

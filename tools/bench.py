@@ -1,6 +1,6 @@
 """Measures the program against the machine, as ratios within one run.
 
-    python tools/bench.py updates     SAC updates inside the real program, against the float32 matrix-product peak
+    python tools/bench.py updates     SAC updates inside the real program, against the peak of matrix products
     python tools/bench.py pieces      what XLA makes of one SAC update: products, fusions and copies inside the loop
     python tools/bench.py capacity    cost of a step at a large and at a small replay capacity
     python tools/bench.py program     cost of a step of the whole program, against its SAC updates alone
@@ -54,9 +54,9 @@ if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in BENCHES:
         print(f"bench: takes one of {', '.join(BENCHES)}, then settings", file=sys.stderr)
         sys.exit(2)
+    about = {"bench": sys.argv[1], **provenance.everything()}  # before: it may be changed while it is measured
     results = BENCHES[sys.argv[1]]()
-    machine = {"bench": sys.argv[1], **provenance.everything()}
-    if sys.argv[1] != "compare":  # which leaves the devices to the programs that it starts
-        machine |= {"devices": jax.device_count(), "platform": jax.default_backend()}
     for result in [results] if isinstance(results, dict) else results:
-        print(json.dumps({**machine, **result}), flush=True)
+        # After: what is measured says how many devices there are. `compare` leaves them to the programs it starts.
+        devices = {"devices": jax.device_count(), "platform": jax.default_backend()} if sys.argv[1] != "compare" else {}
+        print(json.dumps({**about, **devices, **result}), flush=True)

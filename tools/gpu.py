@@ -12,6 +12,7 @@ one that trains its curve besides, `<part>.csv`. The limits of all parts are mor
 first run may need two calls: at 41,000 updates per second the 500 of each of its 35,000 learning steps take 7 minutes.
 """
 
+import contextlib
 import csv
 import functools
 import json
@@ -102,7 +103,7 @@ def main(words: Sequence[str]) -> int:
         if part.name not in wanted:
             continue
         seconds = min(60 * part.minutes, ends - time.monotonic())
-        if seconds < SAVING_S and not tiny:
+        if seconds < (SAVING_S if part.trains else 60 * part.minutes) and not tiny:
             print(f"{part.name}: no time left; call this again", flush=True)
             continue
         done = (train if part.trains else measure)(part, out, seconds, tiny)
@@ -174,8 +175,9 @@ def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     try:
         done = subprocess.run(command, stdout=subprocess.PIPE, timeout=limit, check=False)
     except subprocess.TimeoutExpired as cut:
-        keep(part, out, command, {"found": _measured(cut.stdout)}, ending="_cut")
-        return f"FAILED: took longer than {seconds:.0f} s; {part.name}_cut.json has what was measured until then"
+        if found := _measured(cut.stdout):
+            keep(part, out, command, {"found": found}, ending="_cut")
+        return f"FAILED: took longer than {seconds:.0f} s" + f"; {part.name}_cut.json has what it found" * bool(found)
     if done.returncode:
         return f"FAILED with status {done.returncode}"
     found = _measured(done.stdout)
@@ -183,13 +185,17 @@ def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
         with table.open() as file:
             found = list(csv.DictReader(file))
     keep(part, out, command, {"found": found})
+    (out / f"{part.name}_cut.json").unlink(missing_ok=True)
     return f"{len(found)} lines"
 
 
 def _measured(printed: bytes | None) -> list[dict[str, Any]]:
-    """The lines of a tool that are whole and have figures."""
-    lines = (printed or b"").decode().splitlines()
-    return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
+    """The lines of a tool that have figures; the last one may have been cut."""
+    found = []
+    for line in (printed or b"").decode(errors="replace").splitlines():
+        with contextlib.suppress(ValueError):
+            found += [json.loads(line)] if line.startswith("{") else []
+    return found
 
 
 def keep(part: Part, out: Path, command: list[str], found: dict[str, Any], ending: str = "") -> None:

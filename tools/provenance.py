@@ -2,9 +2,11 @@
 
 import shutil
 import subprocess
+from pathlib import Path
 
 from vecpsmbpo import versions
 
+HERE = Path(__file__).resolve().parents[1]
 MEASURED = ("configs", "envs", "hydra_plugins", "tools", "vecpsmbpo")
 
 
@@ -12,11 +14,11 @@ def code() -> dict[str, str]:
     """The commit of what is measured, with + where it has been changed since, and versions of what it runs on."""
 
     def git(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(["git", *words], capture_output=True, text=True, check=False)
+        return subprocess.run(["git", *words], cwd=HERE, capture_output=True, text=True, check=False)
 
     commit = "unknown"
     if shutil.which("git") and (found := git("rev-parse", "--short", "HEAD")).returncode == 0:
-        changed = git("diff", "--quiet", "HEAD", "--", *MEASURED).returncode
+        changed = git("diff", "--quiet", "HEAD", "--", *MEASURED).returncode != 0
         commit = found.stdout.strip() + "+" * changed
     return {"commit": commit, "versions": versions.line()}
 

@@ -145,11 +145,15 @@ def as_tool(name: str, main: Callable[[Sequence[str]], int], about: str | None, 
     words = sys.argv[1:]
     try:
         if {"-h", "--help"} & set(words):
-            print(explain(name, about or "", options), flush=True)
-            return 0
-        return main(words)
+            print(explain(name, about or "", options))
+            status = 0
+        else:
+            status = main(words)
+        print(end="", flush=True)
+        return status
     except BrokenPipeError:
-        stopping.speak_to_nobody()
+        if not stopping.is_unheard():  # it was another pipe
+            raise
         return stopping.UNHEARD
     except SettingError as error:
         print(f"{name}: {error}", file=sys.stderr)

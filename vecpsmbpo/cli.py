@@ -58,13 +58,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         status = _dispatch(arguments)
         print(end="", flush=True)
         return status
-    except BrokenPipeError:  # of `| head`, which has read enough
-        stopping.speak_to_nobody()
-        return stopping.UNHEARD
     except SettingError as error:
         words.complain(error)
         return 2
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and stopping.is_unheard():
+            return stopping.UNHEARD
         where = f"{error.filename}: " if error.filename else ""
         words.complain(f"{where}{error.strerror or error}")
         return 2

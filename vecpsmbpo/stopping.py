@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import os
+import select
 import signal
 import sys
 import threading
@@ -117,6 +118,17 @@ def _unheard() -> Iterator[None]:
         yield
     except OSError:
         speak_to_nobody()
+
+
+def is_unheard() -> bool:
+    """Whether nobody reads stdout any more, as of `| head`; nothing that is printed from now on is heard then."""
+    with contextlib.suppress(AttributeError, OSError, ValueError):  # it is no file, or there is no such thing as `poll`
+        poll = select.poll()
+        poll.register(sys.stdout.fileno(), 0)  # what is wrong is told unasked
+        if poll.poll(0):
+            speak_to_nobody()
+            return True
+    return False
 
 
 def speak_to_nobody() -> None:

@@ -1,5 +1,6 @@
-"""Simulators on the host: the program of `drivers/scan.py` cut where a simulator is stepped, so that two programs meet
-at a step: what follows it and the action of the next one are one call, with one array in and one out."""
+"""Simulators on the host: the program is cut where they are stepped. `_begin` begins a stride and acts; after each step
+`_follow` observes, learns and acts again; `_settle` ends the stride.
+"""
 
 import itertools
 import zlib
@@ -25,13 +26,14 @@ from vecpsmbpo.drivers.common import (
     never,
     split_for_episodes,
 )
-from vecpsmbpo.envs.host.batched import HostEnv, SimulatorError
+from vecpsmbpo.envs.host.batched import HostEnv, HostStep, SimulatorError
 from vecpsmbpo.layout import BY_SEED, SHARED
 from vecpsmbpo.schedule import begin_stride, observe_and_learn, over_seeds, split_keys
 from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.types import Counters, EpisodeEnd, Hyper, TrainState, Transition
 
 T = TypeVar("T")
+NUMBERS = 3  # of a step, before its observations: reward, terminated, truncated
 
 
 class Acted(NamedTuple):
@@ -52,7 +54,7 @@ class Acted(NamedTuple):
 
 
 class HostDriver:
-    """The same functions, jitted in parts, with a simulator stepped between them."""
+    """The functions of the algorithm, jitted in parts, with a simulator stepped between them."""
 
     def __init__(self, algorithm: Algorithm, env: HostEnv, make_env: Callable[..., HostEnv]):
         """
@@ -103,7 +105,7 @@ class HostDriver:
     def compile(self, state: TrainState) -> None:
         spec, seeds, episodes = self.algorithm.spec, self.layout.num_lanes, self.settings.eval_episodes
         before, _, learning, acted = jax.eval_shape(self._begin, state)
-        stepped = self._shape(3 + 2 * spec.obs_size)
+        stepped = self._shape(NUMBERS + 2 * spec.obs_size)
         episode_keys = jax.eval_shape(lambda key: split_for_episodes(key, episodes).actions, state.seeds.key)
         policies = jax.eval_shape(self._policies, state.seeds, state.seeds.key)
         remembered = jax.eval_shape(lambda: broadcast_leaves(self.algorithm.memory(), seeds, episodes))
@@ -155,10 +157,9 @@ class HostDriver:
             )
 
     def _step(self, action: jax.Array) -> jax.Array:
-        """Steps all simulators: [S, 3 + 2 O], as `_follow_local` takes it apart."""
+        """Steps all simulators; what they say, packed."""
         step = _in_all(partial(self._env.step, np.asarray(processes.here(action))))
-        columns = (step.reward, step.terminated, step.truncated, step.next_obs, step.obs)
-        return self.layout.everywhere(np.column_stack(columns).astype(np.float32), BY_SEED)
+        return self.layout.everywhere(_packed(step), BY_SEED)
 
     def evaluate(
         self, state: TrainState, keys: jax.Array, episodes: int, stopping: Callable[[], bool] = never
@@ -230,15 +231,14 @@ class HostDriver:
     ) -> tuple[TrainState, EpisodeEnd, Acted]:
         """What follows a step of the simulators, and the next action where the stride goes on: another one begins with
         an action of its own."""
-        reward, terminated, truncated = jnp.moveaxis(stepped[:, :3], 1, 0)
-        next_obs, obs = jnp.split(stepped[:, 3:], 2, axis=1)
+        reward, terminated, truncated, next_obs, obs = _unpacked(stepped)
         transition = Transition(state.env, acted.action, reward, next_obs, terminated)
         counters, seeds, end = observe_and_learn(
             self.algorithm,
             state.counters,
             state.seeds.replace(memory=acted.memory, key=acted.key),
             transition,
-            truncated > 0,
+            truncated,
             acted.keys,
             learning,
         )
@@ -261,6 +261,18 @@ def _in_all(call: Callable[[], T]) -> T:
     if processes.greatest(int(failed is not None)):
         raise failed or SimulatorError("its simulator failed in another process of the run, which says how")
     return result
+
+
+def _packed(step: HostStep) -> np.ndarray:
+    """What a step says as one array, [S, NUMBERS + 2 O]: a call of a program is given one instead of five."""
+    columns = (step.reward, step.terminated, step.truncated, step.next_obs, step.obs)
+    return np.column_stack(columns).astype(np.float32)
+
+
+def _unpacked(stepped: jax.Array) -> tuple[jax.Array, ...]:
+    """Reward, terminated and truncated, [S] each; the true successors and what is observed next, [S, O] each."""
+    reward, terminated, truncated = jnp.moveaxis(stepped[:, :NUMBERS], 1, 0)
+    return reward, terminated, truncated > 0, *jnp.split(stepped[:, NUMBERS:], 2, axis=1)
 
 
 def _stacked(news: list[EpisodeEnd]) -> Any:
