@@ -10,6 +10,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import warnings
 
 import jax
 import pytest
@@ -260,6 +261,17 @@ def test_a_reader_that_has_read_enough_is_no_mistake(words, monkeypatch, capsys)
         status = cli.main(words)
     assert (status, unheard) == (141, ["gone"])
     assert capsys.readouterr().err == ""
+
+
+def test_a_cache_that_memory_is_out_for_says_nothing_beside_the_run():
+    """The run's own line says it. Another failure of the cache, which costs every start its compiling, is heard."""
+    failed = "Error reading persistent compilation cache entry for 'jit_body': {}"
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        runtime.configure(tiny())
+        warnings.warn(failed.format("MemoryError: std::bad_alloc"), stacklevel=1)
+        warnings.warn(failed.format("OSError: no such disk"), stacklevel=1)
+    assert [str(warning.message) for warning in heard] == [failed.format("OSError: no such disk")]
 
 
 def test_another_pipe_that_breaks_is_said(monkeypatch, capsys):

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import jax
@@ -46,6 +47,9 @@ def configure(settings: Settings) -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache_dir()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
         jax.config.update("jax_raise_persistent_cache_errors", False)
+        # Where memory is out the run itself says so; what the cache could not read then is compiled, or fails, too.
+        out_of_memory = r"Error (reading|writing) persistent compilation cache entry .*MemoryError"
+        warnings.filterwarnings("ignore", message=out_of_memory)
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter where a plug-in is there and its hardware is not
