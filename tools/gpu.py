@@ -193,8 +193,9 @@ def _measured(printed: bytes | None) -> list[dict[str, Any]]:
     """The lines of a tool that have figures; the last one may have been cut."""
     found = []
     for line in (printed or b"").decode(errors="replace").splitlines():
-        with contextlib.suppress(ValueError):
-            found += [json.loads(line)] if line.startswith("{") else []
+        if line.startswith("{"):
+            with contextlib.suppress(ValueError):
+                found.append(json.loads(line))
     return found
 
 
