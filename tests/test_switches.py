@@ -16,7 +16,7 @@ from tests.test_imagination import constant
 from vecpsmbpo import dynamics, metrics, posterior, sac
 from vecpsmbpo.envs import specs
 from vecpsmbpo.programs import initial_inputs
-from vecpsmbpo.types import Counters, Hyper
+from vecpsmbpo.types import Counters, Hyper, Transition
 
 # ── forced exploration (equation 33) ─────────────────────────────────────────────────────────────────────────────
 
@@ -25,6 +25,27 @@ def test_forced_exploration_by_hand():
     episodes = jnp.array([1, 4, 5, 10, 100])
     np.testing.assert_allclose(posterior.exploration_probability(5.0, episodes), [1, 1, 1, 0.5, 0.05], rtol=1e-6)
     np.testing.assert_array_equal(posterior.exploration_probability(0.0, episodes), np.zeros(5))
+
+
+def test_a_random_action_is_held_and_each_episode_begins_with_a_new_one(key):
+    """A truncated episode of five steps and the beginning of the next, where actions are kept for three."""
+    settings = tiny(random_hold=3, devices=1)
+    learner = algorithm(settings, probes.spec(True))
+
+    def play(counters, key):
+        def step(state, t):
+            act_key, observe_key = jax.random.split(jax.random.fold_in(key, t))
+            action, _ = learner.act(counters, state, jnp.zeros(1), act_key)
+            row = Transition(jnp.zeros(1), action, jnp.float32(0), jnp.zeros(1), jnp.float32(0))
+            return learner.observe(counters, state, row, t == 4, observe_key)[0], action[0]
+
+        return jax.lax.scan(step, learner.init(jax.random.key(0), Hyper.of(settings)), jnp.arange(8))[1]
+
+    shared = learner.layout.specs().counters
+    actions = learner.layout.jit_shard_map(play, (shared, shared), shared)(Counters(jnp.int32(0), jnp.int32(0)), key)
+    first, second, third = actions[0], actions[3], actions[5]
+    np.testing.assert_array_equal(actions, [first] * 3 + [second] * 2 + [third] * 3)
+    assert len({float(first), float(second), float(third)}) == 3
 
 
 # ── random function prior (equation 34) ──────────────────────────────────────────────────────────────────────────

@@ -183,8 +183,15 @@ class Algorithm(ABC):
         policy_key, uniform_key = jax.random.split(key)
         obs = jnp.where(jnp.isfinite(obs), obs, 0.0)  # a simulator's mistake must not become the policy's
         action, memory = self.choose(counters, state, obs, policy_key)
-        uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0, maxval=1.0)
-        return jnp.where(state.episode.random, uniform, action), memory
+        return jnp.where(state.episode.random, self._random_action(state, uniform_key), action), memory
+
+    def _random_action(self, state: SeedState, key: jax.Array) -> jax.Array:
+        """Uniform, [A]; drawn anew at every `random_hold`-th step of an episode, and the step before's at the others."""
+        action = jax.random.uniform(key, (self.spec.action_size,), minval=-1.0, maxval=1.0)
+        if self.settings.random_hold == 1:
+            return action
+        drawn = state.episode.length % self.settings.random_hold == 0
+        return jnp.where(drawn, action, self._unpack(state.newest).action)
 
     # ── observe ──────────────────────────────────────────────────────────────────────────────────────────────
 

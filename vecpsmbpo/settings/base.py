@@ -58,6 +58,7 @@ class Settings:
     network_precision: str = choice("default", "float32", "bfloat16")
     # real data
     warmup_steps: int = whole(1)
+    random_hold: int = whole(1)
     replay_capacity: int = whole(1)
     # dynamics models (A.1)
     n_models: int = whole(1)
