@@ -73,6 +73,7 @@ class Settings:
     model_max_epochs: int = whole(1)
     validation_ratio: float = real(0, 0.5, open_low=True)
     whiten_targets: bool
+    nll_beta: float = real(0, 1)
     prior_scale: float = real(0, traced=True)
     # who acts
     forced_exploration: float = real(0, traced=True)
