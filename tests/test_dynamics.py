@@ -204,3 +204,25 @@ def test_whitened_targets_resolve_changes_that_the_variance_floor_hides(linear, 
             np.testing.assert_allclose(np.exp(prediction.log_variance[:, :2].mean(0) / 2), 1e-4, rtol=0.6)
     assert explained[True].min() > 0.95
     assert explained[False].max() < 0.9
+
+
+def test_a_rare_reward_is_given_up_by_the_likelihood_and_learned_with_beta(key):
+    """One row in 35 has the reward 1, others none: by equation 17 a model is sure of the 0 and gives the others a large
+    variance, which takes their weight away."""
+    obs_key, action_key = jax.random.split(key)
+    obs, action = jax.random.normal(obs_key, (CAPACITY, 2)), jax.random.normal(action_key, (CAPACITY, 1))
+    rewarded = jnp.sum(obs**2, axis=1) < 0.05
+    delta = jnp.stack([0.5 * action[:, 0], -0.2 * obs[:, 0]], axis=1)
+    rows = replay.pack(Transition(obs, action, rewarded.astype(jnp.float32), obs + delta, jnp.zeros(CAPACITY)))
+    expected = {}
+    for beta in (0.0, 1.0):
+        settings = tiny(
+            recipe="stable", nll_beta=beta, model_hidden_size=32, model_batch_size=64, model_max_epochs=100,
+            model_learning_rate=3e-3, model_patience=30,
+        )  # fmt: skip
+        fitted = _compiled_fit(settings, rows)(new_model(key, settings, SPEC), jnp.int32(CAPACITY), key)
+        prediction = dynamics.forward(fitted, obs, action, net=dynamics.network(settings, SPEC))
+        expected[beta] = [float(prediction.mean[which, 2].mean()) for which in (rewarded, ~rewarded)]
+    assert expected[0.0][0] < 0.2
+    assert expected[1.0][0] > 0.6
+    assert abs(expected[1.0][1]) < 0.05
