@@ -146,12 +146,25 @@ def _targets(batch: Transition) -> jax.Array:
     return jnp.concatenate([batch.next_obs - batch.obs, batch.reward[:, None]], axis=-1)
 
 
-def loss(model: Model, batch: Transition, *, net: networks.GaussianMLP, beta: float = 0.0) -> Float[Array, ""]:
+class Beta(NamedTuple):
+    """By how much what is poorly predicted still counts (`loss`): of changes Δs, and of the reward, each in [0, 1]."""
+
+    changes: float
+    reward: float
+
+    @classmethod
+    def of(cls, settings: Settings) -> "Beta":
+        return cls(settings.nll_beta, settings.reward_nll_beta)
+
+
+def loss(
+    model: Model, batch: Transition, *, net: networks.GaussianMLP, beta: Beta = Beta(0.0, 0.0)
+) -> Float[Array, ""]:
     """Equation 17, averaged over rows and outputs; where termination is learned, plus its cross-entropy.
 
     The gradient of equation 17 in μ is (μ - y) / σ²: what a model is still wrong about, and knows to be, hardly counts
-    beside what it already predicts well, and may stay wrong for ever. With `beta` each term counts σ^(2β) times, σ in
-    units of the model's outputs (Seitzer et al. 2022, "On the pitfalls of heteroscedastic uncertainty estimation with
+    beside what it already predicts well, and may stay wrong for ever. With β each term counts σ^(2β) times, σ in units
+    of the model's outputs (Seitzer et al. 2022, "On the pitfalls of heteroscedastic uncertainty estimation with
     probabilistic neural networks", equation 9): 0 is equation 17, 1 has the gradient of the squared error in μ.
 
     Args:
@@ -159,9 +172,10 @@ def loss(model: Model, batch: Transition, *, net: networks.GaussianMLP, beta: fl
     """
     prediction = forward(model, batch.obs, batch.action, net=net)
     terms = negative_log_likelihood(prediction.mean, prediction.log_variance, _targets(batch))
-    if beta:
+    if any(beta):
         log_variance = jax.lax.stop_gradient(prediction.log_variance) - 2 * jnp.log(model.scaling.output_std)
-        terms *= jnp.exp(beta * log_variance)
+        powers = jnp.full(terms.shape[-1], beta.changes).at[-1].set(beta.reward)
+        terms *= jnp.exp(powers * log_variance)
     value = jnp.mean(terms)
     if prediction.logit is not None:
         value += jnp.mean(optax.sigmoid_binary_cross_entropy(prediction.logit, batch.terminated))
@@ -229,7 +243,7 @@ def fit(
 
     def step(params: Params, optimizer: Any, key: jax.Array):
         batch = rows_of(split.train_rows(key, settings.model_batch_size, block))
-        objective = lambda params: loss(model.replace(params=params), batch, net=net, beta=settings.nll_beta)  # noqa: E731
+        objective = lambda params: loss(model.replace(params=params), batch, net=net, beta=Beta.of(settings))  # noqa: E731
         value, gradient = jax.value_and_grad(objective)(params)
         rate, decay = hyper.model_learning_rate, hyper.model_weight_decay
         return *optim.step(gradient, optimizer, params, rate, decay=decay), value

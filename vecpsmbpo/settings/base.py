@@ -74,6 +74,7 @@ class Settings:
     validation_ratio: float = real(0, 0.5, open_low=True)
     whiten_targets: bool
     nll_beta: float = real(0, 1)
+    reward_nll_beta: float = real(0, 1)
     prior_scale: float = real(0, traced=True)
     # who acts
     forced_exploration: float = real(0, traced=True)
