@@ -157,9 +157,7 @@ class Beta(NamedTuple):
         return cls(settings.nll_beta, settings.reward_nll_beta)
 
 
-def loss(
-    model: Model, batch: Transition, *, net: networks.GaussianMLP, beta: Beta = Beta(0.0, 0.0)
-) -> Float[Array, ""]:
+def loss(model: Model, batch: Transition, *, net: networks.GaussianMLP, beta: Beta) -> Float[Array, ""]:
     """Equation 17, averaged over rows and outputs; where termination is learned, plus its cross-entropy.
 
     The gradient of equation 17 in μ is (μ - y) / σ²: what a model is still wrong about, and knows to be, hardly counts

@@ -186,7 +186,7 @@ class Algorithm(ABC):
         return jnp.where(state.episode.random, self._random_action(state, uniform_key), action), memory
 
     def _random_action(self, state: SeedState, key: jax.Array) -> jax.Array:
-        """Uniform, [A]; drawn anew at every `random_hold`-th step of an episode, and the step before's at the others."""
+        """Uniform, [A]; drawn anew at every `random_hold`-th step of an episode, at others that of the step before."""
         action = jax.random.uniform(key, (self.spec.action_size,), minval=-1.0, maxval=1.0)
         if self.settings.random_hold == 1:
             return action
