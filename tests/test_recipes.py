@@ -105,7 +105,8 @@ def test_a_bounded_log_density_stops_growing_where_tanh_saturates(key):
 
 @pytest.mark.parametrize("beta", [(0.0, 0.0), (0.5, 1.0)])
 def test_what_is_poorly_predicted_counts_by_beta(beta, key):
-    """In units of the outputs, the loss moves a mean by (μ - y) σ^(2β - 2), averaged over rows and outputs."""
+    """In units of the outputs, the loss moves a mean by (μ - y) σ^(2β - 2), and a log-variance by σ^(2β) / 2 - (μ - y)²
+    σ^(2β - 2) / 2, whose optimum is the error's square whatever β is; averaged over rows and outputs."""
     spec, settings = specs.get("hopper"), tiny()
     net = dynamics.network(settings, spec)
     model = new_model(key, settings, spec)
@@ -117,12 +118,20 @@ def test_what_is_poorly_predicted_counts_by_beta(beta, key):
         lambda params: dynamics.loss(model.replace(params=params), batch, net=net, beta=dynamics.Beta(*beta))
     )
     last = sorted(model.params["params"])[-1]
-    moved = gradient(model.params)["params"][last]["bias"][: spec.obs_size + 1]
+    of_mean, of_variance = jnp.split(gradient(model.params)["params"][last]["bias"], 2)
     mean, log_variance, _ = dynamics.forward(model, obs, action, net=net)
     error = (mean - jnp.concatenate([change, jnp.arange(5.0)[:, None]], axis=1)) / units
     deviation = jnp.exp(0.5 * log_variance) / units
-    powers = 2 * np.array([beta[0]] * spec.obs_size + [beta[1]]) - 2
-    np.testing.assert_allclose(moved, jnp.mean(error * deviation**powers, axis=0) / len(units), rtol=1e-3)
+    powers = 2 * np.array([beta[0]] * spec.obs_size + [beta[1]])
+    expected = jnp.mean(error * deviation ** (powers - 2), axis=0) / len(units)
+    np.testing.assert_allclose(of_mean, expected, rtol=1e-3)
+    # A.1's soft clamps, of the network's own output to [-10, most], have slopes of their own.
+    inputs = jnp.concatenate([obs, action], axis=1)
+    free = jnp.split(net.apply(model.params, inputs, method=net.outputs), 2, axis=1)[1]
+    most = 2 + jnp.maximum(-2 * jnp.log(units), 0)
+    slope = jax.nn.sigmoid(most - free) * jax.nn.sigmoid(most - jax.nn.softplus(most - free) + 10)
+    expected = jnp.mean(slope * (deviation**powers - error**2 * deviation ** (powers - 2)) / 2, axis=0) / len(units)
+    np.testing.assert_allclose(of_variance, expected, rtol=1e-3, atol=1e-6)
 
 
 def test_the_target_critic_moves_at_every_fourth_update(key):

@@ -122,7 +122,7 @@ class Model(struct.PyTreeNode):
         params: of `networks.GaussianMLP`.
         optimizer: state of Adam; it lives on from refit to refit.
         scaling: see `Scaling`.
-        loss: [], mean negative log-likelihood (equation 17) over the last epoch of the last fit.
+        loss: [], mean of what the last epoch of the last fit descended (`dynamics.loss`: equation 17, or weighted).
         val_mse: [], validation mean squared error of the parameters kept.
         prior: or None, where β = 0.
     """

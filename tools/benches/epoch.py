@@ -24,7 +24,7 @@ from vecpsmbpo.types import TrainState
 
 WORLD_STRIDES = 4
 ACTS = 200
-PROFILE_SECONDS = 150  # after which a large program's strides have been timed often enough
+PROFILE_SECONDS = 150  # after which, with two refreshes, a large program's strides have been timed often enough
 
 
 def bench_profile() -> dict[str, Any]:

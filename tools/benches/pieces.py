@@ -17,7 +17,8 @@ from vecpsmbpo.types import Hyper
 def bench_pieces() -> dict[str, Any]:
     settings = config.compose([*PAPER, *sys.argv[2:]])
     runtime.configure(settings)
-    return {"task": settings.env, "width": settings.policy_hidden_size, **pieces_of_update(settings)}
+    what = {"task": settings.env, "width": settings.policy_hidden_size, "critic_norm": settings.critic_norm}
+    return {**what, **pieces_of_update(settings)}
 
 
 def pieces_of_update(settings: Settings) -> dict[str, int]:
