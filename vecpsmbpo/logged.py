@@ -37,7 +37,8 @@ QUANTITIES = {
     "entropy": Quantity("policy entropy", "entropy of the policies", always=True),
     "q_mean": Quantity("mean Q", "mean Q of what is learned from", always=True),
     "model_loss": Quantity(
-        "model loss (negative log-likelihood)", "negative log-likelihood of the models (equation 17; weighted, where nll_beta is)"
+        "model loss (negative log-likelihood)",
+        "negative log-likelihood of the models (equation 17; weighted, where nll_beta is)",
     ),
     "model_val_mse": Quantity("model validation error", "validation error of the models", "log"),
     "env_steps_per_s": Quantity(
