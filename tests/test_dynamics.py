@@ -217,12 +217,12 @@ def test_a_rare_reward_is_given_up_by_the_likelihood_and_learned_with_beta(key):
     expected = {}
     for beta in (0.0, 1.0):
         settings = tiny(
-            recipe="stable", reward_nll_beta=beta, model_hidden_size=32, model_batch_size=64, model_max_epochs=100,
-            model_learning_rate=3e-3, model_patience=30,
+            recipe="stable", nll_beta=beta / 2, reward_nll_beta=beta, model_hidden_size=32, model_batch_size=64,
+            model_max_epochs=100, model_learning_rate=3e-3, model_patience=30,
         )  # fmt: skip
         fitted = _compiled_fit(settings, rows)(new_model(key, settings, SPEC), jnp.int32(CAPACITY), key)
         prediction = dynamics.forward(fitted, obs, action, net=dynamics.network(settings, SPEC))
         expected[beta] = [float(prediction.mean[which, 2].mean()) for which in (rewarded, ~rewarded)]
     assert expected[0.0][0] < 0.2
-    assert expected[1.0][0] > 0.6
+    assert expected[1.0][0] > 0.5
     assert abs(expected[1.0][1]) < 0.05
