@@ -184,17 +184,7 @@ def test_whitened_targets_resolve_changes_that_the_variance_floor_hides(linear, 
     explained = {}
     for whiten in (False, True):
         chosen = dataclasses.replace(settings, whiten_targets=whiten, model_patience=5)
-
-        @jax.jit
-        def run(key, chosen=chosen):
-            split = dynamics.Split.draw(key, jnp.int32(CAPACITY), CAPACITY, chosen.validation_block)
-            hyper = Hyper.of(chosen)
-            model = new_model(key, chosen, SPEC, hyper)
-            whitening = dynamics.scaling(_moments(small), jnp.int32(CAPACITY), chosen)
-            net = dynamics.network(chosen, SPEC)
-            return dynamics.fit(model, small, split, whitening, hyper, key, net=net, settings=chosen, spec=SPEC)
-
-        fitted = run(key)
+        fitted = _compiled_fit(chosen, small)(new_model(key, chosen, SPEC), jnp.int32(CAPACITY), key)
         obs, action = small[:, :2], small[:, 2:3]
         prediction = dynamics.forward(fitted, obs, action, net=dynamics.network(chosen, SPEC))
         truth = 1e-3 * jnp.stack([0.5 * action[:, 0], -0.2 * obs[:, 0]], axis=1)
