@@ -102,8 +102,8 @@ def main(words: Sequence[str]) -> int:
     for part in PARTS:
         if part.name not in wanted:
             continue
-        seconds = min(60 * part.minutes, ends - time.monotonic())
-        if seconds < (SAVING_S if part.trains else 60 * part.minutes) and not tiny:
+        seconds = None if tiny else min(60 * part.minutes, ends - time.monotonic())
+        if seconds is not None and seconds < (SAVING_S if part.trains else 60 * part.minutes):
             print(f"{part.name}: no time left; call this again", flush=True)
             continue
         done = (train if part.trains else measure)(part, out, seconds, tiny)
@@ -112,8 +112,8 @@ def main(words: Sequence[str]) -> int:
     return int(failed)
 
 
-def train(part: Part, out: Path, seconds: float, tiny: bool) -> str:
-    """Begins or goes on with a run; what became of it."""
+def train(part: Part, out: Path, seconds: float | None, tiny: bool) -> str:
+    """Begins or goes on with a run, for so many seconds (None: as it needs); what became of it."""
     run_dir = out / "runs" / part.name
     words = dict(word.split("=", 1) for word in part.words) | (TINY if tiny else {})
     settings = [f"{name}={value}" for name, value in words.items()]
@@ -121,7 +121,7 @@ def train(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     began = time.monotonic()
     process = subprocess.Popen(command, stdout=sys.stderr)
     try:
-        status = process.wait(max(seconds - SAVING_S, 1) if not tiny else None)
+        status = process.wait(seconds and max(seconds - SAVING_S, 1))
     except subprocess.TimeoutExpired:
         status = stopped(process)
     lines = [line for line in jsonl.read(run_dir / jsonl.METRICS_FILE) if line["eval_return"] is not None]
@@ -162,8 +162,8 @@ def stopped(process: subprocess.Popen) -> int:
         return process.wait()
 
 
-def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
-    """Runs a tool once; what became of it."""
+def measure(part: Part, out: Path, seconds: float | None, tiny: bool) -> str:
+    """Runs a tool once, for so many seconds at most (None: as it needs); what became of it."""
     if (out / f"{part.name}.json").exists():
         return "was measured before"
     tool, *words = part.tiny if tiny else part.words
@@ -171,9 +171,8 @@ def measure(part: Part, out: Path, seconds: float, tiny: bool) -> str:
     if tool == "parity.py":
         words.append(f"output={table}")
     command = [sys.executable, str(HERE / tool), *words]
-    limit = None if tiny else seconds
     try:
-        done = subprocess.run(command, stdout=subprocess.PIPE, timeout=limit, check=False)
+        done = subprocess.run(command, stdout=subprocess.PIPE, timeout=seconds, check=False)
     except subprocess.TimeoutExpired as cut:
         if found := _measured(cut.stdout):
             keep(part, out, command, {"found": found}, ending="_cut")

@@ -14,7 +14,7 @@ from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.programs import initial_inputs, make_driver
 from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import TrainState
+from vecpsmbpo.types import Counters, TrainState
 
 PAPER = [
     "env=hopper",
@@ -61,6 +61,19 @@ def past_warmup(driver: ScanDriver, **hyper: float) -> TrainState:
     return state
 
 
+def with_full_rings(driver: ScanDriver) -> TrainState:
+    """A state before the first step whose rings are full, so that minibatches are gathered from all over them."""
+    state = driver.init(*initial_inputs(driver.settings))
+
+    def fill(ring: jax.Array) -> jax.Array:
+        return jax.jit(lambda: jax.random.uniform(jax.random.key(0), ring.shape), out_shardings=ring.sharding)()
+
+    full = Counters(driver.settings.replay_capacity, driver.algorithm.ring_capacity)
+    counters = jax.tree.map(lambda old, new: jax.device_put(jnp.int32(new), old.sharding), state.counters, full)
+    rings = {name: fill(ring) for name, ring in state.seeds.rings().items()}
+    return state.replace(counters=counters, seeds=state.seeds.replace(**rings))
+
+
 def seconds_per_update(driver: ScanDriver, state: TrainState, repeats: int) -> float:
     """Of G updates of every member, by themselves: `learn` in a jitted loop over the mesh."""
     steps, specs = 5, driver.layout.specs()
@@ -92,7 +105,7 @@ def seconds_per_step(driver: ScanDriver, repeats: int) -> float:
 def bench_updates() -> dict[str, Any]:
     driver = driver_of([*PAPER, "updates_per_step=10", "replay_capacity=20000", "imagined_capacity=20480"])
     settings, spec = driver.settings, driver.algorithm.spec
-    state = driver.init(*initial_inputs(settings))
+    state = with_full_rings(driver)
     peaks = [matmul_peak(settings.network_precision)]
     seconds = seconds_per_update(driver, state, 3) / settings.updates_per_step
     peaks.append(matmul_peak(settings.network_precision))
