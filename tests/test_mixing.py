@@ -11,7 +11,7 @@ import scipy.stats
 
 from tests.helpers import tiny
 from vecpsmbpo import mixing
-from vecpsmbpo.types import Bandit, Hyper
+from vecpsmbpo.types import Hyper
 
 
 @pytest.mark.parametrize("mean", [0.05, 0.3, 0.5, 0.8])
@@ -49,7 +49,7 @@ ARMS = (0.0, 0.1, 0.3, 0.5)
 def _bandit(gains, counts):
     """A range of 0 to 1."""
     numbers = (jnp.asarray(x, jnp.float32) for x in (gains, counts))
-    return Bandit(*numbers, jnp.int32(10), jnp.float32(0.0), jnp.float32(1.0))
+    return mixing.Bandit(*numbers, jnp.int32(10), jnp.float32(0.0), jnp.float32(1.0))
 
 
 def _credited(*episodes):
@@ -144,7 +144,7 @@ def test_the_probability_to_be_the_best_by_quadrature(gains, counts):
 def test_the_bandit_follows_the_best_arm_when_it_changes():
     """400 rounds; arm 0 gains 0.9 in the first half and arm 3 in the second, the others 0.1."""
 
-    def round_(bandit: Bandit, xs):
+    def round_(bandit: mixing.Bandit, xs):
         best, key = xs
         arm = jax.random.categorical(key, jnp.log(mixing.probabilities(bandit)))
         gain = jnp.where(arm == best, 0.9, 0.1)

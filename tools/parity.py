@@ -164,7 +164,7 @@ def compare_steps(port: Port, steps: Step) -> dict[str, float]:
     }
 
 
-def _same_law(one: np.ndarray, other: np.ndarray) -> float:
+def _same_distribution(one: np.ndarray, other: np.ndarray) -> float:
     """p-value of a two-sample Kolmogorov-Smirnov test."""
     return float(scipy.stats.ks_2samp(one, other, method="asymp").pvalue)
 
@@ -178,7 +178,7 @@ def compare_resets(port: Port, name: str, count: int) -> tuple[float, int]:
     values = []
     for one, other in zip(ours.T, theirs.T, strict=True):
         if np.ptp(other) > 0:
-            values.append(_same_law(one, other))
+            values.append(_same_distribution(one, other))
         else:
             values.append(float(np.allclose(one, other, atol=1e-6)))
     worst = int(np.argmin(values))
@@ -216,7 +216,7 @@ def compare_episodes(port: Port, name: str, policy: Policy, count: int) -> dict[
         obs, total, length = news.obs, total + np.where(alive, news.reward, 0.0), length + alive
         alive &= ~(news.terminated | news.truncated)
     found = {
-        f"{what}_p": _same_law(mine, theirs)
+        f"{what}_p": _same_distribution(mine, theirs)
         for what, mine, theirs in zip(("return", "length"), ours, (total, length), strict=True)
     }
     for backend, values in (("mjx", ours), ("host", (total, length))):

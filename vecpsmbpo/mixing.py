@@ -2,10 +2,27 @@
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Float, Int
 
 from vecpsmbpo.settings.parts import PosteriorSettings
-from vecpsmbpo.types import Bandit, Hyper, Number, Whole
+from vecpsmbpo.types import Hyper, Number, Whole
+
+
+class Bandit(struct.PyTreeNode):
+    """What is known of the K values of λ to choose from.
+
+    Attributes:
+        excess, counts: [K], sum of returns above `lowest`, and number, of each arm's episodes, older ones discounted.
+        rounds: [] int, episodes so far.
+        lowest, highest: [], the range of returns, in which old ones are forgotten; ±1e30 before the first.
+    """
+
+    excess: jax.Array
+    counts: jax.Array
+    rounds: jax.Array
+    lowest: jax.Array
+    highest: jax.Array
 
 
 def real_ratios(
@@ -76,7 +93,7 @@ def init(settings: PosteriorSettings) -> Bandit:
     return Bandit(excess=nothing, counts=nothing, rounds=jnp.int32(0), lowest=most, highest=-most)
 
 
-def kept_share(rounds: Whole) -> Float[Array, ""]:
+def discount_of_rounds(rounds: Whole) -> Float[Array, ""]:
     """What of earlier rounds is left after one more: 1 - 1 / (8 √rounds).
 
     The order is that of the optimum for few changes (Garivier and Moulines, 2011, who take 1 / 4); rounds so far stand
@@ -94,7 +111,7 @@ def credit(bandit: Bandit, arm: Whole, episode_return: Number) -> Bandit:
     since sums of the returns themselves, thousands each, would leave nothing but rounding where all are equal.
     """
     rounds = bandit.rounds + 1
-    kept = kept_share(rounds)
+    kept = discount_of_rounds(rounds)
     middle, half = (bandit.highest + bandit.lowest) / 2, (bandit.highest - bandit.lowest) / 2 * kept
     lowest, highest = jnp.minimum(middle - half, episode_return), jnp.maximum(middle + half, episode_return)
     excess = bandit.excess + bandit.counts * (bandit.lowest - lowest)

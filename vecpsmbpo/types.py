@@ -162,22 +162,6 @@ class Posterior(struct.PyTreeNode):
     episodes: jax.Array
 
 
-class Bandit(struct.PyTreeNode):
-    """What is known of the K values of λ to choose from (`mixing`).
-
-    Attributes:
-        excess, counts: [K], sum of returns above `lowest`, and number, of each arm's episodes, older ones discounted.
-        rounds: [] int, episodes so far.
-        lowest, highest: [], the range of returns, in which old ones are forgotten; ±1e30 before the first.
-    """
-
-    excess: jax.Array
-    counts: jax.Array
-    rounds: jax.Array
-    lowest: jax.Array
-    highest: jax.Array
-
-
 class Episode(struct.PyTreeNode):
     """The real episode that is running.
 

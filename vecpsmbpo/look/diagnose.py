@@ -199,13 +199,13 @@ class _Probe:
         truth = np.concatenate([seen.next_obs[rows], seen.reward[rows][:, None]], axis=-1)
         residuals = diagnostics.residuals(models, seen.obs[rows], seen.action[rows], truth, net=net)
         calibration = diagnostics.calibration(np.asarray(residuals))
-        spread = truth.std(axis=0)
+        std = truth.std(axis=0)
         return {
             "dimensions": [*(f"obs {index}" for index in range(spec.obs_size)), "reward"],
-            "spread": spread,
+            "spread": std,
             "windows": windows.there.sum(axis=0),
             **errors._asdict(),
-            "relative": {name: diagnostics.relative(values, spread) for name, values in errors._asdict().items()},
+            "relative": {name: diagnostics.relative(values, std) for name, values in errors._asdict().items()},
             "levels": diagnostics.LEVELS,
             **calibration._asdict(),
         }

@@ -122,12 +122,12 @@ def errors(mean: Array, variance: Array, seen: Windows) -> Errors:
         return Errors(root(squares), root(variance.astype(float)), root((seen.truth - steady) ** 2), root(between))
 
 
-def relative(values: Array, spread: Array) -> Array:
-    """Root mean square over the observation's coordinates, each in units of its deviation `spread` [D]: values
+def relative(values: Array, std: Array) -> Array:
+    """Root mean square over the observation's coordinates, each in units of its deviation `std` [D]: values
     [..., D] -> [...]. Coordinates that do not vary do not count, nor does the reward."""
-    varies = spread[:-1] > 0
+    varies = std[:-1] > 0
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.sqrt(np.mean((values[..., :-1][..., varies] / spread[:-1][varies]) ** 2, axis=-1))
+        return np.sqrt(np.mean((values[..., :-1][..., varies] / std[:-1][varies]) ** 2, axis=-1))
 
 
 def _mean(values: Array, there: Array) -> Array:
@@ -233,8 +233,8 @@ class Nearness(NamedTuple):
 
 def nearness(known: Array, imagined: Array, fresh: Array) -> Nearness:
     """Of states [.., O] each."""
-    spread = known.std(axis=0)
-    unit = np.where(spread > 0, spread, 1.0)
+    std = known.std(axis=0)
+    unit = np.where(std > 0, std, 1.0)
     tree = cKDTree(known / unit)
     return Nearness(*(float(np.median(tree.query(states / unit)[0])) for states in (imagined, fresh)))
 

@@ -143,8 +143,8 @@ def _draw_errors(axes: Axes, found: dict[str, Array], label: str) -> None:
 
 def _draw_dimensions(axes: Axes, models: dict[str, Any], which: str) -> None:
     """`which`, `error` or `expected`, in colours that are the same for both."""
-    spread = _array(models["spread"])
-    unit = np.where(spread > 0, spread, np.nan)
+    std = _array(models["spread"])
+    unit = np.where(std > 0, std, np.nan)
     both = {name: _array(models[name]).mean(axis=0) / unit for name in ("error", "expected")}
     errors, names = both[which], models["dimensions"]
     known = np.concatenate([values[np.isfinite(values) & (values > 0)] for values in both.values()])
@@ -222,9 +222,9 @@ def _history_panels(history: list[dict[str, Any]]) -> Iterator[Panel]:
 
 def _draw_bias(axes: Axes, seen: list[dict[str, Any]]) -> None:
     steps = [point["env_steps"] for point in seen]
-    q, earned, spread = (_array([p["critics"][name] for p in seen]) for name in ("q", "earned", "spread_of_bias"))
+    q, earned, std = (_array([p["critics"][name] for p in seen]) for name in ("q", "earned", "spread_of_bias"))
     looks = style.looks(2)
-    style.line(axes, looks[0], np.array(steps), q, low=q - spread, high=q + spread, label="Q (± s.d. of its error)")
+    style.line(axes, looks[0], np.array(steps), q, low=q - std, high=q + std, label="Q (± s.d. of its error)")
     style.line(axes, looks[1], np.array(steps), earned, label="return really earned")
     style.steps_axis(axes, "environment steps")
     axes.legend(fontsize=7)

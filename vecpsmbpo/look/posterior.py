@@ -107,7 +107,7 @@ def _draw_returns(axes: Axes, episodes: Columns, acts: Array) -> None:
     """What every episode earned, hollow where no member is credited with it; of many episodes how they are spread."""
     index, earned, credited = episodes["episode"], episodes["return"], acts >= 0
     if len(index) > 4 * BINS:
-        _draw_spread(axes, index, earned)
+        _draw_bands(axes, index, earned)
     else:
         dots: dict[str, Any] = {"s": 14, "clip_on": False}  # the last episode's lies on the edge
         alone: dict[str, Any] = {"facecolors": "none", "edgecolors": style.FAINT, "lw": 0.7}
@@ -121,7 +121,7 @@ def _draw_returns(axes: Axes, episodes: Columns, acts: Array) -> None:
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2, ncols=3, handletextpad=0.4)
 
 
-def _draw_spread(axes: Axes, index: Array, earned: Array) -> None:
+def _draw_bands(axes: Axes, index: Array, earned: Array) -> None:
     """Bands of the middle half and of the middle nine tenths of the returns in each bin, and their median."""
     between = edges(len(index))
     parts = [earned[begin:end] for begin, end in itertools.pairwise(between)]

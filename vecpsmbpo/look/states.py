@@ -80,6 +80,6 @@ def principal_plane(clouds: Sequence[Array]) -> list[Array]:
 def _together(clouds: Sequence[Array], place: Callable[[Array], Array]) -> list[Array]:
     """What `place` makes of all states, whitened, for each cloud."""
     obs = np.concatenate(clouds)
-    spread = obs.std(axis=0)
-    places = place((obs - obs.mean(axis=0)) / np.where(spread > 0, spread, 1))
+    std = obs.std(axis=0)
+    places = place((obs - obs.mean(axis=0)) / np.where(std > 0, std, 1))
     return np.split(places, np.cumsum([len(one) for one in clouds])[:-1])

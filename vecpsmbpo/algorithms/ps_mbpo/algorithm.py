@@ -17,10 +17,10 @@ from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
 from vecpsmbpo.feedforward import Feedforward
 from vecpsmbpo.sac import Agent
-from vecpsmbpo.types import Bandit, Counters, Hyper, Params, Posterior, SeedState, Transition, Whole
+from vecpsmbpo.types import Counters, Hyper, Params, Posterior, SeedState, Transition, Whole
 
 
-class Evidence(struct.PyTreeNode):
+class PsMbpoState(struct.PyTreeNode):
     """What choices are made by, besides the returns of members; None where it is not asked for.
 
     Attributes:
@@ -29,7 +29,7 @@ class Evidence(struct.PyTreeNode):
     """
 
     starts: jax.Array | None
-    bandit: Bandit | None
+    bandit: mixing.Bandit | None
 
 
 class PsMbpo(Algorithm):
@@ -67,7 +67,7 @@ class PsMbpo(Algorithm):
             state = state.replace(episode=state.episode.replace(values=unknown))
         else:
             starts = None
-        return state.replace(own=Evidence(starts, mixing.init(settings) if settings.adapts_real_ratio else None))
+        return state.replace(own=PsMbpoState(starts, mixing.init(settings) if settings.adapts_real_ratio else None))
 
     def numbers(self, counters: Counters, state: SeedState) -> dict[str, Any]:
         """λ, of several members their mean, and τ; where λ is chosen online, how likely each is the best."""

@@ -19,7 +19,7 @@ CG_ITERATIONS = 10
 LINE_SEARCH_STEPS = 10  # each half as long as the one before
 VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 20, 256, 1e-3  # of Adam, after each step of the policy
 
-Rows = tuple[Float[Array, "K O"], Float[Array, "K A"], Float[Array, " K"]]  # observations, actions, advantages
+Samples = tuple[Float[Array, "K O"], Float[Array, "K A"], Float[Array, " K"]]  # observations, actions, advantages
 
 
 class TrpoStats(Stats):
@@ -97,10 +97,10 @@ def advantages(
 
 
 def surrogate(
-    policy: Params, old_log_prob: Float[Array, " K"], rows: Rows, entropy_weight: float, *, nets: Networks
+    policy: Params, old_log_prob: Float[Array, " K"], samples: Samples, entropy_weight: float, *, nets: Networks
 ) -> Float[Array, ""]:
     """E[π / π_old · advantage] and the entropy bonus."""
-    obs, action, advantage = rows
+    obs, action, advantage = samples
     distribution = nets.policy.distribution(policy, obs)
     ratio = jnp.exp(distribution.log_prob(action) - old_log_prob)
     return jnp.mean(ratio * advantage) + entropy_weight * jnp.mean(distribution.entropy())
@@ -128,26 +128,26 @@ def natural_direction(
 
 
 def policy_step(
-    policy: Params, rows: Rows, *, trust_region: float, entropy_weight: float, nets: Networks
+    policy: Params, samples: Samples, *, trust_region: float, entropy_weight: float, nets: Networks
 ) -> tuple[Params, Float[Array, ""]]:
     """The policy after one step that improves the surrogate and stays within the trust region, or the same policy where
     no step of the line search does; and by how much the surrogate grew.
     """
     flat, unravel = ravel_pytree(policy)
-    old_log_prob = nets.policy.distribution(policy, rows[0]).log_prob(rows[1])
+    old_log_prob = nets.policy.distribution(policy, samples[0]).log_prob(samples[1])
 
     def objective(x):
-        return surrogate(unravel(x), old_log_prob, rows, entropy_weight, nets=nets)
+        return surrogate(unravel(x), old_log_prob, samples, entropy_weight, nets=nets)
 
     before, gradient = jax.value_and_grad(objective)(flat)
-    direction, fisher = natural_direction(policy, gradient, rows[0], nets=nets)
+    direction, fisher = natural_direction(policy, gradient, samples[0], nets=nets)
     longest = jnp.sqrt(2 * trust_region / jnp.maximum(direction @ fisher(direction), 1e-10))
 
     def candidate(step):
         return flat + 0.5**step * longest * direction
 
     def fails(x):
-        too_far = divergence(unravel(x), policy, rows[0], nets=nets) > trust_region
+        too_far = divergence(unravel(x), policy, samples[0], nets=nets) > trust_region
         return too_far | ~(objective(x) > before)
 
     steps = jax.lax.while_loop(
