@@ -190,7 +190,7 @@ class Checkpoints:
         if host.pop("sum", None) not in (None, _sum(host)):
             raise ValueError("its checksum is wrong")
         if host.get("format") != self._format:
-            raise SettingError(f"{self._directory}: is of another version of this program and cannot be gone on from")
+            raise SettingError(f"{self._directory}: is of another version of this program and cannot be resumed")
         recorded.check(self._settings, host.get("settings", {}))
         plain = _shapes_on_host(shapes, layout)
         as_array = jax.tree.map(lambda x: ocp.ArrayRestoreArgs(restore_type=np.ndarray), plain)

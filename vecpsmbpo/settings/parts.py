@@ -1,4 +1,5 @@
-"""Settings that more than one algorithm may have, as the mathematics beside them reads them."""
+"""Groups of settings that the mathematics is typed by (`sac`, `imagination`, `mixing`), which knows no algorithm: an
+algorithm's own class puts together those that it has."""
 
 import dataclasses
 from collections.abc import Iterator
