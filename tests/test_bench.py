@@ -19,17 +19,18 @@ def test_products_are_counted_inside_loops_only():
     assert pieces.loop_pieces(text)["products"] == 2
 
 
-FUSIONS = {"none": 180, "layer": 280}  # of jax 0.10.2
+FUSIONS = {"none": 180, "layer": 233}  # of jax 0.10.2
 COPIES = 12
 
 
-@pytest.mark.parametrize("norm", list(FUSIONS))
-def test_an_update_is_at_most_45_products(norm):
+@pytest.mark.parametrize(("norm", "means"), [("none", 0), ("layer", 40)])
+def test_an_update_is_at_most_45_products(norm, means):
     """By hand, networks being of three products, forwards: an actor, two targets and two critics, 15, and an actor and
     two critics for the actor's loss, 9. Backwards: two critics to weights and hidden layers, 10, two critics to the
-    actions, 6, and the actor, 5. XLA makes sums of some of those with a single column. Of fusions and copies there may
-    be a quarter more than there were when this was written: XLA changes, too."""
+    actions, 6, and the actor, 5. XLA makes sums of some of those with a single column. LayerNorm's means are products
+    with a column of ones: two for each of the critics' 12 hidden layers forwards, and of the 8 backwards. Of fusions
+    and copies there may be a quarter more than there were when this was written: XLA changes, too."""
     found = pieces.pieces_of_update(config.compose(["env=hopper", f"critic_norm={norm}", "updates_per_step=5"]))
-    assert 30 <= found["products"] <= 45
+    assert 30 <= found["products"] - means <= 45
     assert found["fusions"] <= 1.25 * FUSIONS[norm]
     assert found["copies"] <= 1.25 * COPIES
