@@ -43,8 +43,8 @@ def test_bfloat16_multiplies_the_inner_layers_in_it_forwards_and_backwards():
     found = [types for types, _ in products(jax.make_jaxpr(update)(agent).jaxpr)]
     # By hand: 45 products with two hidden layers. The second of these is the inner one: forwards in two actors and
     # in target, trained and asking critics (twice each), 8; backwards to weights and inputs in the critics' loss, 4;
-    # in the actor's loss to the critics' inputs, 2, and to the actor's weights and inputs, 2. LayerNorm's 40 means, which
-    # `test_bench` counts, are float32.
+    # in the actor's loss to the critics' inputs, 2, and to the actor's weights and inputs, 2. LayerNorm's 40 means,
+    # which `test_bench` counts, are float32.
     assert len(found) == 45 + 40
     assert found.count(frozenset({"bfloat16"})) == 16
     assert found.count(frozenset({"float32"})) == 45 - 16 + 40
