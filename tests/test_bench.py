@@ -24,7 +24,7 @@ COPIES = 12
 
 
 @pytest.mark.parametrize(("norm", "means"), [("none", 0), ("layer", 40)])
-def test_an_update_is_at_most_45_products(norm, means):
+def test_an_update_is_at_most_45_products_and_the_norm_s_means(norm, means):
     """By hand, networks being of three products, forwards: an actor, two targets and two critics, 15, and an actor and
     two critics for the actor's loss, 9. Backwards: two critics to weights and hidden layers, 10, two critics to the
     actions, 6, and the actor, 5. XLA makes sums of some of those with a single column. LayerNorm's means are products
