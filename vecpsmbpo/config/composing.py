@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from vecpsmbpo.algorithms.catalogue import build, check
 from vecpsmbpo.config.choices import GROUPS, default
-from vecpsmbpo.config.overrides import check_algorithm, check_env_values, first_line, parse
+from vecpsmbpo.config.overrides import check_algorithm, check_env_values, first_line, name_of, parse
 from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import CHANGEABLE, SettingError, Settings
 
@@ -75,7 +75,7 @@ def from_tree(tree: DictConfig, overrides: Sequence[str]) -> Settings:
     values["env_options"] = {name: value for name, value in values["env"].items() if name != "name"}
     for group in GROUPS:
         values[group] = values[group]["name"]
-    check_algorithm(values["algo"], (text.split("=")[0].lstrip("+") for text in overrides))
+    check_algorithm(values["algo"], map(name_of, overrides))
     for name, value in values["env_options"].items():
         if value == "???":
             raise SettingError(f"env.{name}: must be given with env={values['env']}")
@@ -89,7 +89,7 @@ def from_tree(tree: DictConfig, overrides: Sequence[str]) -> Settings:
 
 def _default_run_dir(settings: Settings, overrides: Sequence[str]) -> str:
     """The same command gives the same directory, so that running it again goes on with the run."""
-    extra = sorted(text for text in overrides if text.split("=")[0].lstrip("+") not in _UNNAMED)
+    extra = sorted(text for text in overrides if name_of(text) not in _UNNAMED)
     task = [str(value) for _, value in settings.env_options if any(text.startswith("env.") for text in extra)]
     others = [text for text in extra if not text.startswith(("hydra", "env.", "experiment="))]
     experiment = [text.removeprefix("experiment=") for text in extra if text.startswith("experiment=")]

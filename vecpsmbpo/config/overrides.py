@@ -60,6 +60,11 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
     return found
 
 
+def name_of(text: str) -> str:
+    """What an override names, `sweep.*` with Hydra's plus signs or without."""
+    return text.partition("=")[0].lstrip("+")
+
+
 def chosen(group: str, text: str) -> list[str]:
     """The names that an override chooses of a group of Hydra's, quoted or not; none where it is of something else."""
     override = OverridesParser.create().parse_override(text)
