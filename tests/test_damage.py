@@ -275,3 +275,12 @@ def test_what_may_be_swept_keeps_its_order_in_checkpoints(algo, own):
     assert list(vars(hyper)) == f"{shared} {everything}".split()  # also of what the algorithm has not
     leaves = jax.tree_util.tree_leaves_with_path(hyper)
     assert [jax.tree_util.keystr(path) for path, _ in leaves] == [f".{name}" for name in f"{shared} {own}".split()]
+
+
+def test_a_run_trained_with_what_is_no_setting_any_more_is_not_gone_on_with():
+    settings = tiny(run_dir="x")
+    record = recorded.plain(settings)
+    recorded.check_retired(settings, record)
+    recorded.check_retired(settings, {**record, "clip_targets": False})
+    with pytest.raises(SettingError, match="clip_targets=True, which is no setting any more; it can be looked at"):
+        recorded.check_retired(settings, {**record, "clip_targets": True})

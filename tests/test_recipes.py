@@ -19,7 +19,6 @@ OFF = {
     "nll_beta": 0.0,
     "reward_nll_beta": 0.0,
     "critic_norm": "none",
-    "clip_targets": False,
     "bound_log_prob": False,
     "target_update_every": 1,
 }
@@ -76,33 +75,6 @@ def test_a_normed_critic_cannot_grow_with_its_input(key):
 
     assert rise("none") > 1e3
     assert rise("layer") < 10
-
-
-def test_the_range_of_targets_by_hand():
-    # γ = 0.9: ten steps. Rewards in [-1, 2]; α = 0.5, two actions: a bonus of up to 0.9 · 0.5 · 2 log 2 a step, and of
-    # 0.9 · 0.5 · (-3) at the target entropy.
-    hyper = Hyper.of(tiny()).replace(discount=jnp.float32(0.9), target_entropy=jnp.float32(-3.0))
-    least, most = sac.target_range(sac.RewardRange(-1.0, 2.0), 0.5, hyper, 2)
-    assert most == pytest.approx(10 * (2 + 0.9 * np.log(2)), rel=1e-5)
-    assert least == pytest.approx(10 * (-1 - 1.35), rel=1e-5)
-    # Rewards of 1 to 2 only: an episode may end, and earn nothing more.
-    hyper = hyper.replace(target_entropy=jnp.float32(1.0))
-    least, _ = sac.target_range(sac.RewardRange(1.0, 2.0), 0.5, hyper, 2)
-    assert least == 0
-
-
-def test_clipped_targets_enter_the_critics_loss(key):
-    """γ = 0, r = 5 in a batch, but nothing above 1 was seen: Q̂ = 1, Q = 0, twice ½."""
-    spec, settings = specs.get("hopper"), tiny(clip_targets=True)
-    nets = sac.make_networks(settings, spec)
-    agent = sac.init(key, nets, spec)
-    zero = jax.tree.map(jnp.zeros_like, agent.critic)
-    obs, action = jnp.zeros((1, spec.obs_size)), jnp.zeros((1, spec.action_size))
-    batch = Transition(obs, action, jnp.array([5.0]), obs, jnp.zeros(1))
-    loss, _ = sac.critic_loss(
-        zero, agent, batch, jnp.float32(0.0), jnp.zeros_like(action), nets=nets, bounds=(0.0, 1.0)
-    )
-    assert loss == pytest.approx(1.0)
 
 
 def test_a_bounded_log_density_stops_growing_where_tanh_saturates(key):

@@ -80,6 +80,7 @@ class Checkpoints:
         self._directory, self._settings = directory, settings
         self._format = TABLE[settings.algo].format
         self._damaged: list[int] = []
+        self._to_train = not read_only
         read_only = read_only or not processes.is_first()
         several = processes.are_several()
         if several and not read_only:
@@ -192,6 +193,8 @@ class Checkpoints:
         if host.get("format") != self._format:
             raise SettingError(f"{self._directory}: is of another version of this program and cannot be resumed")
         recorded.check(self._settings, host.get("settings", {}))
+        if self._to_train:
+            recorded.check_retired(self._settings, host.get("settings", {}))
         plain = _shapes_on_host(shapes, layout)
         as_array = jax.tree.map(lambda x: ocp.ArrayRestoreArgs(restore_type=np.ndarray), plain)
         state = ocp.args.PyTreeRestore(plain, restore_args=as_array)

@@ -8,6 +8,9 @@ from vecpsmbpo.settings import SettingError, Settings
 
 SHOWN = 6  # contradictions that a line names
 
+# Settings that there were, and the value with which they did nothing.
+RETIRED = {"policy_learning_rate_decay": 1.0, "clip_targets": False}
+
 
 def plain(settings: Settings) -> dict[str, Any]:
     """Value by name, in the types of JSON and YAML."""
@@ -36,4 +39,18 @@ def check(settings: Settings, record: Mapping[str, Any]) -> None:
         raise SettingError(
             f"run_dir={settings.run_dir}: its checkpoints were made with {', '.join(wrong[:SHOWN] + more)}; "
             "put config.yaml right, or give another run_dir"
+        )
+
+
+def check_retired(settings: Settings, record: Mapping[str, Any]) -> None:
+    """That a checkpoint can be trained on: that it was not made with what this version does not have.
+
+    Raises:
+        SettingError: it was.
+    """
+    gone = [f"{name}={record[name]}" for name, off in RETIRED.items() if record.get(name, off) != off]
+    if gone:
+        raise SettingError(
+            f"run_dir={settings.run_dir}: was trained with {', '.join(gone)}, which is no setting any more; it can be "
+            "looked at and evaluated, not resumed"
         )

@@ -56,13 +56,6 @@ class Noise(NamedTuple):
         return cls(*jax.random.normal(key, (2, *shape)))
 
 
-class RewardRange(NamedTuple):
-    """The least and the most reward of a step, [] each, as far as they are known."""
-
-    lowest: jax.Array
-    highest: jax.Array
-
-
 def make_networks(settings: SacSettings, spec: EnvSpec) -> Networks:
     """Of every member: obs [..., O] -> a distribution over actions [..., A], and Q_1, Q_2 [...] of the two."""
     size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
@@ -107,20 +100,6 @@ def target_value(
     return reward + discount * (1 - terminated) * (next_q - alpha * next_log_prob)
 
 
-def target_range(
-    reward_range: RewardRange, alpha: Number, hyper: Hyper, action_size: int
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The least and the most that Q can be, if rewards stay within `reward_range`.
-
-    At every step the entropy bonus of equations 24 and 29 is at most that of uniform actions, α A log 2, and about that
-    of the target entropy where that is negative. No reward at all, as after a termination, is always possible.
-    """
-    steps = 1 / jnp.maximum(1 - hyper.discount, 1e-6)  # 1 + γ + γ² + …
-    most = jnp.maximum(reward_range.highest, 0.0) + hyper.discount * alpha * action_size * jnp.log(2.0)
-    least = jnp.minimum(reward_range.lowest, 0.0) + hyper.discount * alpha * jnp.minimum(hyper.target_entropy, 0.0)
-    return least * steps, most * steps
-
-
 def critic_loss(
     critic: Params,
     agent: Agent,
@@ -129,15 +108,12 @@ def critic_loss(
     noise: Float[Array, "B A"],
     *,
     nets: Networks,
-    bounds: tuple[Number, Number] | None = None,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """½ (Q - Q̂)² for both critics (equation 27), Q̂ within `bounds`, and the mean of Q over the batch."""
+    """½ (Q - Q̂)² for both critics (equation 27), and the mean of Q over the batch."""
     next_action, next_log_prob = nets.actor.distribution(agent.actor, batch.next_obs).reparameterized(noise)
     next_q = jnp.minimum(*nets.critic.values(agent.target_critic, batch.next_obs, next_action))
     alpha = jnp.exp(agent.log_alpha)
     target = target_value(batch.reward, batch.terminated, next_q, next_log_prob, alpha, discount)
-    if bounds is not None:
-        target = jnp.clip(target, *bounds)
     first, second = nets.critic.values(critic, batch.obs, batch.action)
     return 0.5 * jnp.mean((first - target) ** 2 + (second - target) ** 2), jnp.mean(first)
 
@@ -164,7 +140,6 @@ def update(
     hyper: Hyper,
     *,
     nets: Networks,
-    reward_range: RewardRange | None = None,
     target_every: int = 1,
     mean: Callable[[Any], Any] = lambda parts: parts,
 ) -> Agent:
@@ -173,16 +148,14 @@ def update(
 
     Args:
         batch: leaves [B, ...].
-        reward_range: of a step, if the critics' targets are to be kept within what these allow.
         mean: of losses and gradients over the parts of a minibatch that lies on several devices.
     """
     rate = hyper.policy_learning_rate
 
     alpha = jnp.exp(agent.log_alpha)
-    bounds = None if reward_range is None else target_range(reward_range, alpha, hyper, batch.action.shape[-1])
     critic_value_and_grad = jax.value_and_grad(critic_loss, has_aux=True)
     (loss_q, q_mean), critic_gradient = mean(
-        critic_value_and_grad(agent.critic, agent, batch, hyper.discount, noise.next_action, nets=nets, bounds=bounds)
+        critic_value_and_grad(agent.critic, agent, batch, hyper.discount, noise.next_action, nets=nets)
     )
     critic, critic_optimizer = optim.step(critic_gradient, agent.critic_optimizer, agent.critic, rate)
 

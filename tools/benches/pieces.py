@@ -31,13 +31,10 @@ def pieces_of_update(settings: Settings) -> dict[str, int]:
         rows = jnp.zeros((*shape, replay.row_size(spec.obs_size, spec.action_size)))
         batches = replay.unpack(rows, spec.obs_size, spec.action_size)
         noise = sac.Noise.draw(key, (*shape, spec.action_size))
-        nothing = sac.RewardRange(jnp.zeros(()), jnp.zeros(()))
-        return sac.init(key, nets, spec), batches, noise, Hyper.of(settings), nothing
+        return sac.init(key, nets, spec), batches, noise, Hyper.of(settings)
 
-    def run(agent: Any, batches: Any, noise: Any, hyper: Hyper, reward_range: sac.RewardRange) -> Any:
-        known = reward_range if settings.clip_targets else None
-        every = settings.target_update_every
-        return sac.updates(agent, batches, noise, hyper, nets=nets, reward_range=known, target_every=every)
+    def run(agent: Any, batches: Any, noise: Any, hyper: Hyper) -> Any:
+        return sac.updates(agent, batches, noise, hyper, nets=nets, target_every=settings.target_update_every)
 
     return loop_pieces(jax.jit(run).lower(*jax.eval_shape(inputs)).compile().as_text())
 

@@ -157,7 +157,8 @@ class PsMbpo(Algorithm):
             q = jnp.minimum(*nets.critic.values(agent.critic, starts, action))
             return jnp.sum(jnp.where(known, q, 0.0)) / jnp.maximum(jnp.sum(known), 1)
 
-        least, most = sac.target_range(_reward_range(state), jnp.float32(0.0), state.hyper, self.spec.action_size)
+        steps = 1 / jnp.maximum(1 - state.hyper.discount, 1e-6)  # 1 + γ + γ² + …
+        least, most = state.moments.lowest_reward * steps, state.moments.highest_reward * steps
         return jnp.clip(self.layout.all_members(jax.vmap(value)(state.agents)), least, most)
 
     def _of_member(
@@ -278,13 +279,11 @@ class PsMbpo(Algorithm):
         noise = jax.vmap(partial(sac.Noise.draw, shape=shape))(layout.keys(update_key, ids))
         batches, noise = layout.part((batches, noise), axis=2)
 
-        reward_range = _reward_range(state) if settings.clip_targets else None
-
-        def update(agent, batches, noise, hyper, reward_range):
+        def update(agent, batches, noise, hyper):
             how = {"target_every": settings.target_update_every, "mean": layout.mean_of_parts}
-            return sac.updates(agent, batches, noise, hyper, nets=nets, reward_range=reward_range, **how)
+            return sac.updates(agent, batches, noise, hyper, nets=nets, **how)
 
-        return layout.map_local(update, state.agents, batches, noise, shared=(state.hyper, reward_range))
+        return layout.map_local(update, state.agents, batches, noise, shared=(state.hyper,))
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings
@@ -314,8 +313,3 @@ class PsMbpo(Algorithm):
         from_real = jax.random.uniform(source_key, shape) < real_ratio
         rows = jnp.where(from_real[..., None], state.real[real_index], imagined[imagined_index])
         return self._unpack(rows)
-
-
-def _reward_range(state: SeedState) -> sac.RewardRange:
-    """Of all real steps so far."""
-    return sac.RewardRange(state.moments.lowest_reward, state.moments.highest_reward)
