@@ -19,7 +19,6 @@ OFF = {
     "nll_beta": 0.0,
     "reward_nll_beta": 0.0,
     "critic_norm": "none",
-    "bound_log_prob": False,
     "target_update_every": 1,
 }
 
@@ -75,16 +74,6 @@ def test_a_normed_critic_cannot_grow_with_its_input(key):
 
     assert rise("none") > 1e3
     assert rise("layer") < 10
-
-
-def test_a_bounded_log_density_stops_growing_where_tanh_saturates(key):
-    free, bounded = networks.TanhGaussian(jnp.array([9.0]), jnp.array([1e-3])), networks.LOG_PROB_BOUND
-    bounded = networks.TanhGaussian(free.loc, free.scale, bounded)
-    # -log(1 - tanh² u) at u = 3.8 is 6.215, and 2 (u - log 2) = 16.61 at 9.
-    assert free.sample(key)[1] - bounded.sample(key)[1] == pytest.approx(16.614 - 6.215, abs=0.02)
-    assert np.tanh(networks.LOG_PROB_BOUND) == pytest.approx(0.999, abs=1e-4)
-    inside = networks.TanhGaussian(jnp.array([1.0]), jnp.array([0.1]))
-    assert inside.sample(key)[1] == inside._replace(most=networks.LOG_PROB_BOUND).sample(key)[1]
 
 
 @pytest.mark.parametrize("beta", [(0.0, 0.0), (0.5, 1.0)])

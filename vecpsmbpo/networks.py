@@ -13,7 +13,6 @@ from vecpsmbpo.types import Params
 
 MIN_LOG_VARIANCE, MAX_LOG_VARIANCE = -10.0, 2.0
 MIN_SCALE = 1e-3  # Acme's floor under the standard deviation of the policy
-LOG_PROB_BOUND = 3.8  # arctanh(0.999), where Acme's log-densities of a tanh stop to grow
 
 
 class Precision(NamedTuple):
@@ -171,12 +170,10 @@ class TanhGaussian(NamedTuple):
 
     Attributes:
         loc, scale: [..., A].
-        most: |u| beyond which log-densities grow no further.
     """
 
     loc: jax.Array
     scale: jax.Array
-    most: float = float("inf")
 
     def sample(self, key: PRNGKeyArray) -> tuple[Float[Array, "*batch A"], Float[Array, "*batch"]]:
         """An action and its log-density."""
@@ -189,8 +186,7 @@ class TanhGaussian(NamedTuple):
         pre_tanh = self.loc + self.scale * noise
         log_normal = -0.5 * noise**2 - jnp.log(self.scale) - 0.5 * jnp.log(2 * jnp.pi)
         # log(1 - tanh²u) = 2 (log 2 - u - softplus(-2u)): no cancellation where tanh saturates.
-        bounded = jnp.clip(pre_tanh, -self.most, self.most)
-        log_slope = 2 * (jnp.log(2.0) - bounded - jax.nn.softplus(-2 * bounded))
+        log_slope = 2 * (jnp.log(2.0) - pre_tanh - jax.nn.softplus(-2 * pre_tanh))
         return jnp.tanh(pre_tanh), jnp.sum(log_normal - log_slope, axis=-1)
 
     def mode(self) -> Float[Array, "*batch A"]:
@@ -202,14 +198,12 @@ class Actor(nn.Module):
     """π(a | s), tanh-Gaussian.
 
     Attributes:
-        most: see `TanhGaussian`.
         precision: a name in `PRECISIONS`.
     """
 
     action_size: int
     hidden_size: int
     hidden_layers: int
-    most: float = float("inf")
     precision: str = "default"
 
     @nn.compact
@@ -218,7 +212,7 @@ class Actor(nn.Module):
         mlp = ReluMLP(2 * self.action_size, self.hidden_size, self.hidden_layers, precision=self.precision)
         outputs = mlp(obs)
         loc, raw_scale = jnp.split(outputs, 2, axis=-1)
-        return TanhGaussian(loc, nn.softplus(raw_scale) + MIN_SCALE, self.most)
+        return TanhGaussian(loc, nn.softplus(raw_scale) + MIN_SCALE)
 
     def distribution(self, params: Params, obs: Float[Array, "*batch O"]) -> TanhGaussian:
         """π(· | obs) of these parameters."""

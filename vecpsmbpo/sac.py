@@ -59,10 +59,9 @@ class Noise(NamedTuple):
 def make_networks(settings: SacSettings, spec: EnvSpec) -> Networks:
     """Of every member: obs [..., O] -> a distribution over actions [..., A], and Q_1, Q_2 [...] of the two."""
     size, layers = settings.policy_hidden_size, settings.policy_hidden_layers
-    most = networks.LOG_PROB_BOUND if settings.bound_log_prob else float("inf")
     precision = settings.network_precision
     return Networks(
-        actor=networks.Actor(spec.action_size, size, layers, most, precision),
+        actor=networks.Actor(spec.action_size, size, layers, precision),
         critic=networks.TwinCritic(size, layers, settings.critic_norm, precision),
     )
 

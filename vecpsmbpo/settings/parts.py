@@ -28,7 +28,6 @@ class SacSettings(PolicySettings):
     target_update_rate: float = real(0, 1, open_low=True, traced=True)
     target_update_every: int = whole(1)
     critic_norm: str = choice("none", "layer")
-    bound_log_prob: bool
 
     @property
     def minibatch(self) -> int:
