@@ -178,7 +178,7 @@ def test_figure_5_has_an_asymptote_where_one_is_known(tmp_path):
     with style.styled():
         drawn = figure.DRAW["fig5"](experiments.load("fig5", tmp_path))
     names = [axis.get_legend_handles_labels()[1][1:] for axis in drawn.axes]
-    assert names == [["SAC at 100k steps"], ["SAC at 200k steps"], []]
+    assert names == [["SAC at 4M steps"], ["SAC at 4M steps"], []]
 
 
 @pytest.mark.parametrize(("seeds", "said"), [(1, "one seed"), (2, "mean of 2 seeds, band: standard error")])
