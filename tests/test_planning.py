@@ -46,6 +46,17 @@ def test_cross_entropy_begins_where_it_is_told(key):
         np.testing.assert_allclose(found, np.sign(start) * 0.7, atol=0.05)
 
 
+def test_a_plan_in_which_a_model_diverges_is_worth_nothing(key):
+    settings = tiny(algo="pets", plan_population=100, plan_elites=10, plan_iterations=8)
+
+    def value(plans, key):
+        best = -jnp.sum((plans - 0.5) ** 2, axis=(1, 2))
+        return jnp.where(plans[:, 0, 0] < 0, jnp.nan, jnp.where(plans[:, 1, 0] < 0, jnp.inf, best))
+
+    found = planning.cross_entropy(value, jnp.zeros((2, 1)), key, settings)
+    np.testing.assert_allclose(found, 0.5, atol=0.05)
+
+
 def _counters(settings):
     """Two models: model n adds 2 n + 1 to the state, and pays 10 n + 1."""
     models = [new_model(jax.random.key(0), settings, SPEC)] * 2

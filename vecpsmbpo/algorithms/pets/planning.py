@@ -39,7 +39,9 @@ def cross_entropy(
         deviation = jnp.sqrt(jnp.minimum(variance, room**2))
         noise = jax.random.truncated_normal(draw_key, -2.0, 2.0, (settings.plan_population, *mean.shape))
         plans = mean + deviation * noise
-        _, best = jax.lax.top_k(value(plans, value_key), settings.plan_elites)
+        worth = value(plans, value_key)
+        # Of a plan in which a model diverges nothing is known; `top_k` would put NaN first.
+        _, best = jax.lax.top_k(jnp.where(jnp.isfinite(worth), worth, -jnp.inf), settings.plan_elites)
         elites = plans[best]
         mean = SMOOTHING * mean + (1 - SMOOTHING) * jnp.mean(elites, axis=0)
         variance = SMOOTHING * variance + (1 - SMOOTHING) * jnp.var(elites, axis=0)
