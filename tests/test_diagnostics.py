@@ -198,6 +198,20 @@ def test_fresh_episodes_of_the_probe(kind, terminates):
         np.testing.assert_array_equal(np.flatnonzero(found.terminated[episode]), [1] if terminates else [])
 
 
+def test_no_key_of_a_fresh_world_s_reset_is_one_of_its_actions_keys():
+    """`diagnose` draws actions of both with the same seed, and what `split` makes of a key `fold_in` makes, too."""
+
+    class Keyed(probes.Probe):
+        def reset(self, rng):
+            return super().reset(rng).replace(obs=jax.random.key_data(rng))
+
+    world = fresh.MjxWorld(Keyed(False), 3, seed=5)
+    resets = {tuple(row) for _ in range(3) for row in world.reset()}
+    steps = jax.vmap(lambda t: jax.random.split(jax.random.fold_in(jax.random.key(5), t), 3))(jnp.arange(50))
+    assert len(resets) == 9
+    assert not resets & {tuple(row) for row in np.asarray(jax.random.key_data(steps)).reshape(-1, 2)}
+
+
 def test_a_step_that_is_not_finite_ends_an_episode_before_it():
     world = fresh.MjxWorld(probes.FailingProbe(), 8, seed=0)
     found = fresh.collect(world, lambda *_: (np.ones((8, 1)), np.zeros(8)), 9, jax.random.key(0))

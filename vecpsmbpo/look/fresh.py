@@ -71,6 +71,9 @@ def _programs(env: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
     return jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
 
 
+_RESETS = 2**31 - 1  # no step of an episode
+
+
 class MjxWorld:
     """MJX environments. One whose episode is over goes on: nobody looks at it any more."""
 
@@ -81,7 +84,9 @@ class MjxWorld:
         self.state: Any = None  # leaves [E, ...]
 
     def rewind(self) -> None:
-        self._key = jax.random.key(self._seed)
+        # Folded: whoever acts here draws with what `fold_in` makes of the seed's key and a step, and the parts that
+        # `split` makes of a key are the same as those of its first steps.
+        self._key = jax.random.fold_in(jax.random.key(self._seed), _RESETS)
 
     def reset(self) -> Array:
         self._key, key = jax.random.split(self._key)  # episodes that follow one another begin differently
