@@ -65,6 +65,23 @@ def test_one_run_has_no_interval():
 # ── curves and tables ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
+def test_a_seed_that_was_frozen_before_it_had_a_value_is_left_out(tmp_path):
+    """Its group is that of the others, and readers are told."""
+    early = dict.fromkeys(looks.epochs([0])[0]) | {"env_steps": 20, "seed": 1, "frozen": True}
+    lines = [*looks.epochs([1, 2, 3]), early, *looks.epochs([3, 4, 5], seed=2)]
+    one = looks.write(tmp_path / "one", lines, num_seeds=3)
+    found = runs.load_all([one])
+    (group,) = groups.group(found)
+    found_curve = curves.curve(group, "env_steps", "eval_return")
+    np.testing.assert_array_equal(found_curve.y, [2, 3, 4])
+    assert found_curve.seeds.shape == (2, 3)
+    (row,) = compare.table(found, looks.options())
+    assert (len(row.scores["cartpole_swingup"]), row.frozen, row.cells["best"].value) == (2, 1, 4)
+    assert list(runs.warnings(found)) == [
+        f"{one}: seed 1 was frozen at step 20, before its first evaluation: it is in no average of those"
+    ]
+
+
 def test_a_frozen_seed_counts_with_what_it_had_reached_and_a_slow_one_ends_the_curve(mixed):
     ops, ps = (curves.curve(group, "env_steps", "eval_return") for group in groups.group(runs.load_all(mixed)))
     np.testing.assert_array_equal(ops.x, [40, 80, 120])

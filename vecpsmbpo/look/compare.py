@@ -122,7 +122,7 @@ def table(found: Sequence[Run], options: dict[str, Any]) -> list[Row]:
         here = [one for one in here if one.lanes]
         scales[task] = _scale(here[0].lanes[0], options)
         steps = _common_steps(here, options["steps"])
-        scored = {one.name: {task: [score(lane, steps, options) for lane in one.lanes]} for one in here}
+        scored = {one.name: {task: _scores(one, steps, options)} for one in here}
         for one in here:
             frozen = sum(lane.frozen for lane in one.lanes)
             cells = _cells(scored[one.name], scored.get(base) if one.name != base else None, scales)
@@ -142,6 +142,12 @@ def _common_steps(here: Sequence[Group], asked: int) -> int:
         if lane.epochs["env_steps"][-1] < asked:
             raise SettingError(f"steps={asked}: {lane.run.path} has not come to it ({lane.name})")
     return asked or int(min(lane.epochs["env_steps"][-1] for lane in going))
+
+
+def _scores(group: Group, steps: int, options: dict[str, Any]) -> list[Seed]:
+    """Of its lanes, but for those that were frozen before they had a value."""
+    scores = [(score(lane, steps, options), lane.frozen) for lane in group.lanes]
+    return [seed for seed, frozen in scores if not (frozen and np.isnan(seed.final))] or [scores[0][0]]
 
 
 def score(lane: Lane, steps: int, options: dict[str, Any]) -> Seed:

@@ -97,8 +97,8 @@ def curve(
 ) -> Curve:
     """Average and band of a group, from the first point that all of its seeds have to the last.
 
-    A frozen seed counts to the end with what it had reached. An epoch without a value (no episode ended in it) counts
-    as the one before.
+    A frozen seed counts to the end with what it had reached, and not at all where it had no value yet. An epoch without
+    a value (no episode ended in it) counts as the one before.
 
     Args:
         smooth: how many epochs each point is the mean of.
@@ -116,8 +116,11 @@ def joined(
     band: Callable[[Array, str], tuple[Array, Array]] = bootstrap_band,
 ) -> Curve:
     """As `curve`, of lines that somebody else has made: where each lane of the group has a value, and the value."""
-    lines_with_frozen = list(zip(lines, (lane.frozen for lane in group.lanes), strict=True))
-    if any(not len(at) for at, _ in lines):
+    lines_with_frozen = [
+        (line, lane.frozen) for line, lane in zip(lines, group.lanes, strict=True) if len(line[0]) or not lane.frozen
+    ]
+    lines = [line for line, _ in lines_with_frozen]
+    if not lines or any(not len(at) for at, _ in lines):
         nothing = np.empty(0)
         return Curve(group.name, nothing, nothing, nothing, nothing, np.empty((len(lines), 0)))
     first = max(at[0] for at, _ in lines)

@@ -192,7 +192,9 @@ def warnings(runs: Iterable[Run]) -> Iterator[str]:
             yield f"{run.path}: has come to step {run.env_steps:,} of {run.settings.total_steps:,}"
         for lane in run.lanes:
             if lane.frozen:
-                yield f"{run.path}: {lane.name} was frozen at step {lane.epochs['env_steps'][-1]:.0f}"
+                evaluated = known(lane.epochs.get("eval_return", np.empty(0))).any()
+                before = "" if evaluated else ", before its first evaluation: it is in no average of those"
+                yield f"{run.path}: {lane.name} was frozen at step {lane.epochs['env_steps'][-1]:.0f}{before}"
 
 
 def known(values: Array) -> Array:
