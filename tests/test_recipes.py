@@ -38,6 +38,15 @@ def test_a_laptop_takes_the_stable_recipe_and_the_command_line_wins():
     assert config.compose(["size=cpu", "critic_norm=none"]).critic_norm == "none"
 
 
+@pytest.mark.parametrize("env", list(registry.TASKS))
+def test_presets_learn_from_what_is_imagined(env):
+    """λ at most one half, and more than one model: what SAC on real data alone would not be."""
+    options = [f"env.{name}=x" for name, value in config.env_options(env).items() if value == "???"]
+    settings = config.compose([f"env={env}", "size=cpu", *options])
+    assert settings.real_ratio <= 0.5
+    assert settings.n_models >= 2
+
+
 def test_layer_norm_by_hand():
     # (1, 3, 5, 3) has mean 3 and variance 2.
     found = networks.layer_norm(jnp.array([1.0, 3.0, 5.0, 3.0]))

@@ -119,6 +119,22 @@ def test_with_the_average_no_member_acts_or_is_credited(averaged):
     np.testing.assert_array_equal(state.seeds.posterior.returns, 0)
 
 
+def test_the_first_episode_after_the_warm_up_has_k_1(key):
+    """Equation 33 at τ = 1: it is random for certain, the second one with probability one half."""
+    settings = tiny(forced_exploration=1.0)
+    learner = algorithm(settings, probes.spec(False))
+    earned, hyper = posterior.init(settings.n_members), Hyper.of(settings)
+
+    def random(index):
+        begin = lambda k: learner._begin_episode(  # noqa: E731
+            earned, None, hyper, jnp.int32(index), jnp.int32(60), jnp.bool_(False), k
+        )
+        return jax.vmap(begin)(jax.random.split(key, 400)).random
+
+    assert random(61).all()
+    assert 160 < random(62).sum() < 240  # four standard deviations around 200
+
+
 def test_swept_values_run_side_by_side(averaged):
     """Of 240 episodes after the warm-up, none is random at τ = 0; at 60 those with probability min(1, 60 / k), where
     the first of them has k = 1."""
