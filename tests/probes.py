@@ -100,7 +100,8 @@ class FailingProbe(Probe):
         left = state.pipeline_state - 1
         after = super().step(state.replace(obs=jnp.nan_to_num(state.obs)), action)
         fails = left == 0
-        obs = jnp.where(fails & (action[0] > 0), jnp.nan, after.obs)
+        diverges = jnp.where(action[0] > 0.5, 1e20, jnp.nan)  # on its way there, and there
+        obs = jnp.where(fails & (action[0] > 0), diverges, after.obs)
         reward = jnp.where(fails & (action[0] <= 0), jnp.inf, after.reward)
         return after.replace(pipeline_state=left, obs=obs, reward=reward)
 
@@ -128,7 +129,8 @@ class FailingGymnasium(gymnasium.Env):
         reward = self.obs * (1 - float(action[0]) ** 2)
         self.obs, self.steps = 1 - self.obs, self.steps + 1
         fails = self.steps % 7 == 0
-        obs = np.array([1e39 if fails and action[0] > 0 else self.obs])  # infinite in float32
+        diverges = 1e20 if action[0] > 0.5 else 1e39  # on its way to infinity, and there in float32
+        obs = np.array([diverges if fails and action[0] > 0 else self.obs])
         return obs, -np.inf if fails and action[0] <= 0 else reward, False, False, {}
 
 

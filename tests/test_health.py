@@ -1,6 +1,7 @@
 """Lanes that stop being finite, and simulators that return NaN: whole runs on both drivers, and by parts."""
 
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -19,6 +20,7 @@ from tests import probes
 from tests.helpers import algorithm, argv, initial, tiny, without_times
 from vecpsmbpo import checkpoint, evaluate, health, jsonl, placement, programs, replay, training
 from vecpsmbpo.envs.host.batched import HostEnv
+from vecpsmbpo.look import members, runs, states
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Counters, TrainState
 
@@ -158,6 +160,21 @@ def test_a_run_whose_lanes_are_all_frozen_stops(backend, tmp_path, capsys):
     assert strict(tmp_path / "run" / "metrics.jsonl") == lines
 
 
+def test_what_a_frozen_lane_has_seen_ends_where_it_is_held(diverged):
+    """What its ring receives afterwards is not drawn: its states, nor figure 8's."""
+    settings, good, state = diverged
+    own = health.own_rows(state.seeds.health, settings.total_steps, settings.stride)
+    assert own.tolist() == [settings.total_steps] * 2 + [FIRST_LEARNING_STEP, settings.total_steps]
+    run = runs.load(Path(settings.run_dir))
+    found = states.visited(run)
+    steps = np.split(found.steps, np.flatnonzero(np.diff(found.steps) < 0) + 1)
+    assert [int(at.max()) + 1 for at in steps] == own.tolist()
+    held = np.asarray(good.seeds.real[LANE, :FIRST_LEARNING_STEP, 0])
+    np.testing.assert_array_equal(found.obs[len(steps[0]) + len(steps[1]) :][: len(held), 0], held)
+    lane = members.load(run, LANE)
+    assert len(lane.real_states(1000, np.random.default_rng(0))) == FIRST_LEARNING_STEP
+
+
 def test_a_real_kill_after_the_freezing(backend, tmp_path):
     """kill -9 as soon as the screen says so; the command again ends the run with status 1, and no line twice."""
     arguments = [f"env.make={MAKE[backend]}", f"sweep.policy_learning_rate={BAD}".replace(" ", "")]
@@ -191,7 +208,7 @@ def test_what_a_simulator_returns_is_stored_only_if_it_is_finite(healthy):
     lines = strict(Path(settings.run_dir) / "episodes.jsonl")
     for lane, rate in enumerate(GOOD):
         stored = np.asarray(state.seeds.real[lane, :steps])
-        assert np.isfinite(stored).all()
+        assert (np.abs(stored) < 1e10).all()
         again = np.concatenate([[(stored[0] == 0).all()], (stored[1:] == stored[:-1]).all(axis=1)])
         rows = jax.tree.map(np.asarray, replay.unpack(jnp.asarray(stored), 1, 1))
         np.testing.assert_allclose(rows.reward, rows.obs[:, 0] * (1 - rows.action[:, 0] ** 2), atol=1e-6)
@@ -218,7 +235,9 @@ def test_evaluation_ends_where_a_simulator_fails(healthy):
     driver, saved = evaluate.restore(settings)
     returns = driver.evaluate(saved.state, programs.evaluation_keys(settings, 1), 20)
     assert np.isfinite(returns.episode_return).all()
-    assert len(np.unique(returns.length)) > 1
+    assert 0 < returns.broken_off.sum() < returns.broken_off.size
+    assert (returns.length[~returns.broken_off] == probes.EPISODE_LENGTH).all()
+    assert (returns.length[returns.broken_off] <= probes.EPISODE_LENGTH).all()
 
 
 def test_a_task_that_fails_is_named_in_every_epoch(healthy):
@@ -227,7 +246,35 @@ def test_a_task_that_fails_is_named_in_every_epoch(healthy):
     for epoch in (40, 80, 120):
         steps = sum(line["unsound_steps"] for line in lines if line["env_steps"] == epoch)
         assert steps > 5
-        assert f"{settings.task} returned NaN or infinity at {steps} of 160 steps of this epoch" in said
+        assert f"the simulator of {settings.task} diverged (" in said
+        assert f") at {steps} of 160 steps of this epoch" in said
+        episodes = sum(line["eval_broken_off"] for line in lines if line["env_steps"] == epoch)
+        assert (f"in {episodes} of 4 episodes of this evaluation" in said) == (episodes > 0)
+
+
+@pytest.mark.parametrize(("suite", "name"), [("gymnasium", "halfcheetah"), ("metaworld", "window_open")])
+def test_a_simulator_that_begins_anew_is_not_believed(suite, name):
+    """C MuJoCo does so by itself where it diverges, and gives a fine observation."""
+    make = getattr(importlib.import_module(f"vecpsmbpo.envs.host.{suite}"), name)
+    env = make(num_envs=2, seed=0)
+    env.reset()
+    env.simulators[1].env.unwrapped.data.qvel[:] = 1e11
+    step = env.step(np.zeros((2, env.spec.action_size)))
+    np.testing.assert_array_equal(step.sound, [True, False])
+    np.testing.assert_array_equal(step.truncated, [False, True])
+    assert env.step(np.zeros((2, env.spec.action_size))).sound.all()
+
+
+def test_the_simulators_of_a_frozen_lane_stand_still():
+    env = HostEnv(probes.spec(False), [probes.ProbeSimulator(False) for _ in range(2)])
+    env.reset()
+    for _ in range(probes.EPISODE_LENGTH - 1):
+        step = env.step(np.zeros((2, 1)), still=np.array([False, True]))
+    saved = env.save()
+    assert saved["lengths"] == [probes.EPISODE_LENGTH - 1, 0]
+    assert [simulator["obs"] for simulator in saved["simulators"]] == [(probes.EPISODE_LENGTH - 1) % 2, 0]
+    np.testing.assert_array_equal(step.next_obs[1], 0.0)
+    assert step.sound.all()
 
 
 def test_a_diverged_policy_moves_host_simulators_by_zeros():

@@ -155,7 +155,12 @@ class Run:
         lanes, (count, episodes) = self.settings.lanes, returns.episode_return.shape
         columns = {name: np.repeat([lane[name] for lane in lanes], episodes) for name in lanes[0]}
         columns["episode"] = np.tile(np.arange(episodes), count)
-        return _table(columns | {"return": returns.episode_return.ravel(), "length": returns.length.ravel()})
+        found = {
+            "return": returns.episode_return,
+            "length": returns.length,
+            "broken_off": returns.broken_off,
+        }
+        return _table(columns | {name: values.ravel() for name, values in found.items()})
 
 
 class Policy:

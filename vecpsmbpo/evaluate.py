@@ -42,6 +42,9 @@ def show(stored: Settings, settings: Settings) -> int:
     who = f"policy: {settings.eval_policy}, {settings.eval_actions} actions"
     title = f"{settings.task} ({settings.backend}) at step {step}, {who}"
     print_returns(title, zip(settings.lanes, returns.episode_return, returns.length, strict=True))
+    if returns.broken_off.any():
+        count, of_all = returns.broken_off.sum(), returns.broken_off.size
+        words.warn(f"the simulator diverged in {count} of {of_all} episodes; each ended there, with its return so far")
     return 0
 
 

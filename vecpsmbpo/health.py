@@ -3,7 +3,8 @@
 A lane is a seed with its swept values. At the end of every stride all of it is looked at but the rings, whose rows are
 looked at before they are written. Where something is not finite, the lane is put back to where the stride began, in
 that stride and in every later one. It is computed on, since shapes are fixed, and its rings receive rows, since their
-positions are shared; but nothing that is logged, credited, evaluated or saved sees any of it.
+positions are shared (`own_rows` says which are its own); but nothing that is logged, credited or evaluated sees any of
+it.
 """
 
 from functools import partial
@@ -15,7 +16,7 @@ import numpy as np
 
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import Health, SeedState, TrainState
+from vecpsmbpo.types import LARGEST_NUMBER, Health, SeedState, TrainState
 
 # A code is a rank times `_WIDTH` plus the index of a member or model. Ranks are the entries of `PASSING` and then
 # the leaves of the state. Of several the smallest leaf is named; what passed by is as a rule its consequence.
@@ -43,11 +44,18 @@ def frozen(health: Health) -> Any:
     return health.code != NOWHERE
 
 
+def own_rows(health: Health, step: int, stride: int) -> Any:
+    """How many rows of D_E, of those of `step` environment steps, are what the lanes have seen, [S]: a frozen lane's
+    end with the state that it is held at."""
+    return np.where(frozen(health), np.asarray(health.env_steps) - stride, step)
+
+
 def settle(layout: Layout, before: TrainState, after: TrainState) -> tuple[TrainState, jax.Array]:
     """Ends a stride: freezes lanes in which something is not finite, and puts the frozen ones back.
 
     Args:
-        before: the state without rings that the stride began with; it is all finite.
+        before: the state without rings that the stride began with. What is looked at is all finite in it; where the
+            environment has just been reset to NaN, that is not, until the next step mends it.
 
     Returns:
         `after` with the lanes that are frozen as in `before`, their rings excepted; and which these are, [S] bool.
@@ -69,10 +77,14 @@ def settle(layout: Layout, before: TrainState, after: TrainState) -> tuple[Train
     return after.replace(seeds=seeds, env=held[1]), now
 
 
+def possible(x: jax.Array) -> jax.Array:
+    """Which numbers a simulator can mean: not those of one that has diverged, on its way to infinity or there."""
+    return jnp.abs(x) <= LARGEST_NUMBER  # False for NaN
+
+
 def sound(obs: jax.Array, reward: jax.Array, next_obs: jax.Array) -> jax.Array:
-    """Whether a step's numbers are finite: obs [..., O], reward [...], next_obs [..., O] -> bool [...]."""
-    finite = [jnp.isfinite(x).all(axis=-1) for x in (obs, next_obs)]
-    return finite[0] & finite[1] & jnp.isfinite(reward)
+    """Whether a step's numbers are possible: obs [..., O], reward [...], next_obs [..., O] -> bool [...]."""
+    return possible(obs).all(axis=-1) & possible(next_obs).all(axis=-1) & possible(reward)
 
 
 def _leaves(seeds: SeedState) -> list[tuple[str, str, Any]]:

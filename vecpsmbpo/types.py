@@ -26,6 +26,9 @@ TerminationRule = Callable[
     [Float[Array, "*batch O"], Float[Array, "*batch A"], Float[Array, "*batch O"]], Bool[Array, "*batch"]
 ]
 
+# A simulator that gives a larger number has diverged: MuJoCo's own bound (mjMAXVAL) on what it computes with.
+LARGEST_NUMBER = 1e10
+
 
 @dataclass(frozen=True)
 class EnvSpec:

@@ -9,7 +9,7 @@ import numpy as np
 
 from vecpsmbpo import words
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.types import EnvSpec
+from vecpsmbpo.types import LARGEST_NUMBER, EnvSpec
 
 
 class SimulatorError(SettingError):
@@ -48,7 +48,7 @@ class HostStep(NamedTuple):
         terminated: [B] bool.
         truncated: [B] bool, the episode ended for another reason, as a rule its time limit.
         next_obs: [B, O] the true successors, also where an episode ended.
-        sound: [B] bool, the step's numbers are finite; where they are not, the episode was truncated.
+        sound: [B] bool, the step's numbers are possible; where they are not, the episode was truncated.
     """
 
     obs: np.ndarray
@@ -90,10 +90,13 @@ class HostEnv:
             self._obs = np.stack([self._shaped(simulator.reset()) for simulator in self.simulators])
         return self._obs
 
-    def step(self, actions: np.ndarray) -> HostStep:
+    def step(self, actions: np.ndarray, still: np.ndarray | None = None) -> HostStep:
         """actions [B, A] in [-1, 1]; values outside are clipped, and NaN is 0.
 
-        A simulator that returns NaN or infinity (in float32) is reset.
+        A simulator that returns NaN, infinity or what is beyond `LARGEST_NUMBER` is reset.
+
+        Args:
+            still: [B] bool, simulators that are left as they are: nobody uses what they say.
 
         Raises:
             ValueError: `actions` has another shape.
@@ -104,17 +107,22 @@ class HostEnv:
             raise ValueError(f"actions must have shape {expected}, not {np.shape(actions)}")
         # NaN: of a policy that has diverged, until its lane is frozen. Some simulators fail at it.
         actions = np.clip(np.nan_to_num(np.asarray(actions, np.float64)), -1.0, 1.0)
+        still = np.zeros(self.num_envs, bool) if still is None else still
         with _others_code():
-            results = [simulator.step(action) for simulator, action in zip(self.simulators, actions, strict=True)]
+            results = [
+                (before, 0.0, False, False) if is_still else simulator.step(action)
+                for simulator, action, before, is_still in zip(self.simulators, actions, self._obs, still, strict=True)
+            ]
             obs, rewards, terminated, cut = zip(*results, strict=True)
             next_obs = np.stack([self._shaped(one) for one in obs])
             with np.errstate(over="ignore"):  # to infinity, which is looked for
                 reward = np.asarray(rewards, np.float64).astype(np.float32)
             terminated, cut = np.asarray(terminated, bool), np.asarray(cut, bool)
-        sound = np.isfinite(np.column_stack([self._obs, next_obs, reward])).all(axis=1)
+        numbers = np.column_stack([self._obs, next_obs, reward])
+        sound = (np.abs(numbers) <= LARGEST_NUMBER).all(axis=1)  # False for NaN
         terminated = terminated & sound
-        self._lengths += 1
-        truncated = (cut | (self._lengths >= self.episode_length) | ~sound) & ~terminated
+        self._lengths += ~still
+        truncated = (cut | (self._lengths >= self.episode_length) | ~sound) & ~terminated & ~still
         self._obs = next_obs.copy()
         for index in np.flatnonzero(terminated | truncated):
             with _others_code():

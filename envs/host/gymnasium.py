@@ -48,6 +48,8 @@ class GymnasiumSimulator(Simulator):
             self._state.begin_step(action)
         scaled = self._low + (action + 1) * (self._high - self._low) / 2
         obs, reward, terminated, truncated, _ = self.env.step(scaled.astype(self.env.action_space.dtype))
+        if self._state and self._state.diverged:
+            return np.full(np.shape(obs), np.nan), np.nan, False, False
         return obs, float(reward), bool(terminated), bool(truncated)
 
     def save(self) -> dict[str, Any]:

@@ -64,6 +64,8 @@ class MetaworldSimulator(Simulator):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         self._state.begin_step(action)
         obs, reward, _, _, _ = self.env.step(action)  # Metaworld never terminates
+        if self._state.diverged:
+            return np.full_like(obs, np.nan), np.nan, False, False
         return obs, float(reward), False, False
 
     def save(self) -> dict[str, Any]:

@@ -7,6 +7,12 @@ import mujoco
 import numpy as np
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+# What C MuJoCo notes where it has diverged; it goes on from the model's initial state as if nothing had happened.
+_DIVERGED = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 
 
 class MujocoState:
@@ -36,6 +42,13 @@ class MujocoState:
     def begin_step(self, action: np.ndarray) -> None:
         """To be called before a control step."""
         self._before, self._action = self._read(), np.array(action)
+        for warning in _DIVERGED:
+            self._data.warning[warning].number = 0
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the simulator has, in the control step that was begun last: what it gives is no successor then."""
+        return any(self._data.warning[warning].number > 0 for warning in _DIVERGED)
 
     def save(self) -> dict[str, Any]:
         return {

@@ -181,7 +181,7 @@ class Algorithm(ABC):
         Shapes: obs [O] -> action [A].
         """
         policy_key, uniform_key = jax.random.split(key)
-        obs = jnp.where(jnp.isfinite(obs), obs, 0.0)  # a simulator's mistake must not become the policy's
+        obs = jnp.where(health.possible(obs), obs, 0.0)  # a simulator's mistake must not become the policy's
         action, memory = self.choose(counters, state, obs, policy_key)
         return jnp.where(state.episode.random, self._random_action(state, uniform_key), action), memory
 
@@ -206,7 +206,8 @@ class Algorithm(ABC):
         """Stores a real transition (line 7); where it ends the episode, credits the member (line 15) and draws who acts
         in the next one (lines 1 and 3).
 
-        Where something in it is not finite, the episode ends before it, truncated, with the return so far.
+        Where something in it is not possible (`health.possible`), the episode ends before it, truncated, with the
+        return so far.
         """
         episode = state.episode
         row, sound = self._row(state, transition)
@@ -229,7 +230,7 @@ class Algorithm(ABC):
         random = counters.env_steps + 1 < self.settings.warmup_steps
         index, warmups = episode.index + 1, episode.warmups + random
         stored = self._unpack(row)
-        state = self.note_start(state, jnp.where(jnp.isfinite(transition.obs), transition.obs, stored.obs))
+        state = self.note_start(state, jnp.where(health.possible(transition.obs), transition.obs, stored.obs))
         running = episode.replace(episode_return=total, length=length)
         values = self.values(state.replace(episode=running))
         following = self._begin_episode(state.posterior, values, state.hyper, index, warmups, random, key)
@@ -249,11 +250,11 @@ class Algorithm(ABC):
     def _row(self, state: SeedState, transition: Transition) -> tuple[jax.Array, jax.Array]:
         """The row [F] to store for a transition, and whether it is the transition: [] bool.
 
-        One that is not finite is never stored. Since every seed adds a row per step, the last good one is stored again;
-        at a run's very first step there is none, and it is a row of zeros.
+        One that is not possible is never stored. Since every seed adds a row per step, the last good one is stored
+        again; at a run's very first step there is none, and it is a row of zeros.
         """
         row = replay.pack(transition)
-        sound = jnp.all(jnp.isfinite(row))
+        sound = jnp.all(health.possible(row))
         return jnp.where(sound, row, state.newest), sound
 
     def _unpack(self, rows: jax.Array) -> Transition:

@@ -24,10 +24,16 @@ COMPILED_QUICKLY = {"xla_backend_optimization_level": 0}
 
 
 class Returns(NamedTuple):
-    """Of evaluation episodes, [S, E] each."""
+    """Of evaluation episodes, [S, E] each.
+
+    Attributes:
+        episode_return, length: of each; of one that was broken off until then.
+        broken_off: bool, whether the simulator diverged, which ended it.
+    """
 
     episode_return: np.ndarray
     length: np.ndarray
+    broken_off: np.ndarray
 
 
 class Interrupted(Exception):

@@ -123,22 +123,23 @@ class HostDriver:
 
     def run(self, state: TrainState, strides: int) -> tuple[TrainState, EpisodeEnd]:
         news: list[EpisodeEnd] = []
+        frozen = np.asarray(health.frozen(processes.here(state.seeds.health)))
         for _ in range(strides):
             self._saved_env = self._env.save()
             before, state, learning, acted = self._begin(state)
             ends: list[EpisodeEnd] = []
             try:
                 for _ in range(self.settings.stride):
-                    state, end, acted = self._follow(state, acted, self._step(acted.action), learning)
+                    state, end, acted = self._follow(state, acted, self._step(acted.action, frozen), learning)
                     ends.append(end)
             except SimulatorError as error:
                 # Rows that were written to the rings lie beyond the counters, and will be written again.
                 step = int(before.counters.env_steps) + len(ends) + 1
                 whole = before.replace(seeds=before.seeds.replace(**state.seeds.rings()))
                 raise Interrupted(step, whole, _stacked(news), error) from error
-            state, frozen = self._settle(before, state)
+            state, now = self._settle(before, state)
             # Of the whole stride at once: to fetch what a step returns would be nine waits for the device at each.
-            ends, frozen = jax.tree.map(np.asarray, processes.here((ends, frozen)))
+            ends, frozen = jax.tree.map(np.asarray, processes.here((ends, now)))
             news += [end.replace(done=end.done & ~frozen) for end in ends]
         self._saved_env = None
         self._check_alike()
@@ -156,9 +157,9 @@ class HostDriver:
                 "depend on more than their seeds and actions"
             )
 
-    def _step(self, action: jax.Array) -> jax.Array:
-        """Steps all simulators; what they say, packed."""
-        step = _in_all(partial(self._env.step, np.asarray(processes.here(action))))
+    def _step(self, action: jax.Array, frozen: np.ndarray) -> jax.Array:
+        """Steps the simulators of all lanes but the frozen ones; what they say, packed."""
+        step = _in_all(partial(self._env.step, np.asarray(processes.here(action)), still=frozen))
         return self.layout.everywhere(_packed(step), BY_SEED)
 
     def evaluate(
@@ -174,7 +175,8 @@ class HostDriver:
         compiled_for = self._compiled_evaluation_actions if episodes == self.settings.eval_episodes else None
         act, count = compiled_for or self._evaluation_actions, seeds * episodes
         memory = self.layout.everywhere(broadcast_leaves(self.algorithm.memory(), seeds, episodes), BY_SEED)
-        total, length, alive = np.zeros(count), np.zeros(count, int), np.ones(count, bool)
+        total, length, broken_off = np.zeros(count), np.zeros(count, int), np.zeros(count, bool)
+        alive = ~broken_off
         for t in itertools.count():
             if not alive.any():
                 break
@@ -187,8 +189,9 @@ class HostDriver:
             obs = step.obs
             total += np.where(alive & step.sound, step.reward, 0.0)
             length += alive
+            broken_off |= alive & ~step.sound
             alive &= ~(step.terminated | step.truncated)
-        return Returns(total.reshape(seeds, episodes), length.reshape(seeds, episodes))
+        return Returns(*(x.reshape(seeds, episodes) for x in (total, length, broken_off)))
 
     def _others(self, num_envs: int, seed: int) -> HostEnv:
         """Environments to evaluate in.

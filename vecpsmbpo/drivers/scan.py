@@ -86,7 +86,7 @@ class ScanDriver:
             if stopping():
                 raise Stopped
             running = go_on(policies, split.actions, running)
-        return Returns(*map(np.asarray, processes.here((running.total, running.length))))
+        return Returns(*map(np.asarray, processes.here((running.total, running.length, running.broken_off))))
 
     def save_env(self) -> dict[str, Any]:
         return {}  # the environments are part of the train state
@@ -148,7 +148,7 @@ class ScanDriver:
             count = keys.resets.shape[0]
             memory = broadcast_leaves(self.algorithm.memory(), count)
             env, zeros = jax.vmap(self._reset)(keys.resets), jnp.zeros(count)
-            begun = _Episodes(jnp.int32(0), memory, env, zeros, zeros.astype(int), zeros == 0)
+            begun = _Episodes(jnp.int32(0), memory, env, zeros, zeros.astype(int), zeros > 0, zeros == 0)
             return self.algorithm.evaluation_policy(seed, keys.policy), begun
 
         return jax.vmap(one_seed)(seeds, keys)
@@ -165,7 +165,8 @@ class ScanDriver:
                 sound = health.sound(now.env.obs, env.reward, env.obs)
                 total = now.total + jnp.where(now.alive & sound, env.reward, 0.0)
                 alive = now.alive & sound & (env.done == 0) & (now.t + 1 < self.settings.episode_length)
-                return _Episodes(now.t + 1, memory, env, total, now.length + now.alive, alive)
+                broken_off = now.broken_off | (now.alive & ~sound)
+                return _Episodes(now.t + 1, memory, env, total, now.length + now.alive, broken_off, alive)
 
             return jax.lax.while_loop(lambda now: (now.t < end) & jnp.any(now.alive), step, episodes)
 
@@ -179,6 +180,7 @@ class _Episodes(NamedTuple):
         t: [] int, steps so far.
         memory, env: leaves [E, ...].
         total, length: [E], returns and steps so far.
+        broken_off: [E] bool, which ended because their simulator diverged.
         alive: [E] bool, which are not over.
     """
 
@@ -187,4 +189,5 @@ class _Episodes(NamedTuple):
     env: Any
     total: jax.Array
     length: jax.Array
+    broken_off: jax.Array
     alive: jax.Array

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vecpsmbpo import networks, posterior, replay, sac
+from vecpsmbpo import health, networks, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.checkpoint import Saved
 from vecpsmbpo.drivers.common import evaluation_policies
@@ -85,7 +85,9 @@ class Trained:
     def real_states(self, most: int, random: np.random.Generator) -> Array:
         """[..., O], some of the observations that real steps of D_E led to."""
         ring = self.state.real[self.index]
-        return self._observations(ring, random.permutation(min(self.step, len(ring)))[:most])
+        oldest = max(0, self.step - len(ring))
+        own = int(health.own_rows(self.state.health, self.step, self.run.settings.stride)[self.index])
+        return self._observations(ring, (oldest + random.permutation(max(own - oldest, 1)))[:most] % len(ring))
 
     def imagined_states(self, most: int, random: np.random.Generator) -> Array | None:
         """[..., O], some of the observations that imagined steps led to, of those that policies learn from now, of all

@@ -48,15 +48,17 @@ def visited(run: Run) -> Visited:
     Raises:
         SettingError: it holds no checkpoint.
     """
+    from vecpsmbpo import health
     from vecpsmbpo.evaluate import restore  # and JAX with it
 
     driver, saved = restore(run.settings)
     rings = np.asarray(saved.state.seeds.real)
     oldest = max(0, saved.step - rings.shape[1])
-    steps = np.unique(np.linspace(oldest, saved.step - 1, ROWS).astype(int))
+    own = health.own_rows(saved.state.seeds.health, saved.step, run.settings.stride)
+    steps = [np.unique(np.linspace(oldest, max(last - 1, oldest), ROWS).astype(int)) for last in own]
     size = driver.algorithm.spec.obs_size
-    obs = np.concatenate([ring[steps % len(ring), :size] for ring in rings])
-    return Visited(run, np.tile(steps, len(rings)), obs)
+    obs = np.concatenate([ring[at % len(ring), :size] for ring, at in zip(rings, steps, strict=True)])
+    return Visited(run, np.concatenate(steps), obs)
 
 
 def plane(clouds: Sequence[Array]) -> list[Array]:

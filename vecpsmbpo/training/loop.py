@@ -280,6 +280,8 @@ class _Session:
         self.display.epoch(self.env_steps, float(np.mean([line["eval_return"] for line in lines])))
         if unsound := sum(line["unsound_steps"] for line in lines):
             self.display.say(sayings.unsound(self.settings, unsound, len(lines) * settings.epoch_steps))
+        if broken_off := sum(line["eval_broken_off"] for line in lines):
+            self.display.say(sayings.broken_off(settings, broken_off, len(lines) * settings.eval_episodes))
         epoch = self.env_steps // settings.epoch_steps
         if epoch % settings.checkpoint_every == 0 and self.env_steps < settings.total_steps:
             self._save()
@@ -305,6 +307,7 @@ class _Session:
                 **line,
                 "eval_return": float(returns.episode_return[index].mean()),
                 "eval_length": float(returns.length[index].mean()),
+                "eval_broken_off": int(returns.broken_off[index].sum()),
                 "env_steps_per_s": rates.env_steps,
                 "updates_per_s": rates.updates,
                 "imagined_per_s": rates.imagined,
@@ -332,10 +335,11 @@ class _Session:
     def _last_line(self, line: metrics.Line, lane: int) -> metrics.Line:
         """A lane's last, from `line` of its last good state. Its step is one that every checkpoint which knows of the
         freezing has reached, and no other: it is never written twice."""
-        unknown = ("eval_return", "eval_length", "env_steps_per_s", "updates_per_s", "imagined_per_s")
+        evaluated = ("eval_return", "eval_length", "eval_broken_off")
+        speeds = ("env_steps_per_s", "updates_per_s", "imagined_per_s")
         return {
             **line,
-            **dict.fromkeys(unknown),
+            **dict.fromkeys(evaluated + speeds),
             "env_steps": int(self.health.env_steps[lane]),
             "compile_seconds": self.driver.compile_seconds,
             "seconds": self.watch(),

@@ -50,11 +50,19 @@ def frozen(settings: Settings, lane: int, step: int, what: str) -> str:
 
 
 def unsound(settings: Settings, steps: int, of_steps: int) -> str:
-    """Of a task whose simulator returned NaN or infinity at some steps of an epoch: also where it was once, since that
-    is a fault, and not so often as to hide anything else."""
+    """Of a task whose simulator did at some steps of an epoch: also where it was once, since that is a fault, and not
+    so often as to hide anything else."""
     return (
-        f"{settings.task} returned NaN or infinity at {steps} of {of_steps} steps of this epoch; each of them ended "
-        "its episode, and none is stored"
+        f"the simulator of {settings.task} diverged (NaN, infinity, or numbers beyond 1e10) at {steps} of {of_steps} "
+        "steps of this epoch; each of them ended its episode, and none is stored"
+    )
+
+
+def broken_off(settings: Settings, episodes: int, of_episodes: int) -> str:
+    """Of a task whose simulator diverged in an evaluation."""
+    return (
+        f"the simulator of {settings.task} diverged in {episodes} of {of_episodes} episodes of this evaluation; each "
+        "ended there, with its return so far"
     )
 
 
