@@ -162,13 +162,14 @@ def score(lane: Lane, steps: int, options: dict[str, Any]) -> Seed:
         at, values = np.append(at, missing), np.append(values, np.full(len(missing), values[-1]))
     threshold = options["threshold"]
     reached = NAN if threshold is None else next((x for x, y in zip(at, values, strict=True) if y >= threshold), np.inf)
-    seconds = lane.epochs.get("seconds", np.empty(0))[: np.sum(lane.epochs["env_steps"] <= steps)]
+    seconds = lane.epochs.get("seconds", np.full(len(lane.epochs["env_steps"]), NAN))
+    seconds = seconds[(lane.epochs["env_steps"] <= steps) & runs.known(seconds)]
     return Seed(
         final=float(values[-options["window"] :].mean()),
         best=float(values.max()),
         area=float(values.mean()),
         reached=float(reached),
-        seconds=float(np.nanmax(seconds, initial=0.0)),
+        seconds=float(seconds.max()) if len(seconds) else NAN,
     )
 
 
@@ -298,7 +299,7 @@ def caption(rows: Sequence[Row], options: dict[str, Any]) -> str:
         parts.append(f"P(better): that a run's final score is above one of {base} (baseline=).")
     if options["threshold"] is not None:
         parts.append(f"steps to: {options['threshold']:g} (threshold=), median over seeds.")
-    if any("seconds" in row.cells for row in rows):
+    if "seconds" in _columns(rows):
         parts.append("seconds: wall time of the program that a seed was in, with all other seeds in it; median.")
     if any(row.frozen for row in rows):
         parts.append("A frozen seed counts as what it had reached.")
