@@ -13,12 +13,11 @@ What a table does not have, its runs do not have either: there are no episodes, 
 
 import csv
 import dataclasses
-import itertools
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from vecpsmbpo import arguments, config
 from vecpsmbpo.config import CONFIG_FILE
@@ -27,28 +26,49 @@ from vecpsmbpo.look import files
 from vecpsmbpo.settings import SettingError, Settings
 
 OPTIONS = {"out": arguments.out("where the run directories go", "runs/putback")}
-Row = dict[str, str]
+
+
+class Line(NamedTuple):
+    """A row of the table, as metrics.jsonl has it.
+
+    Attributes:
+        lane: its seed and swept values.
+        numbers: the others.
+    """
+
+    lane: dict[str, Any]
+    numbers: dict[str, Any]
 
 
 def main(words: Sequence[str]) -> int:
     """The tool; its exit status.
 
     Raises:
-        SettingError: a mistake in `words` or in the table, or a directory that is not empty.
+        SettingError: a mistake in `words` or in the table, or a run that is there already. Nothing is written then.
     """
     own = [word for word in words if word.partition("=")[0] in OPTIONS]
     _, options = arguments.parse("putback", own, OPTIONS)
     table, *rest = [word for word in words if word not in own] or [""]
+    if not table:
+        raise SettingError("needs a table of curves, and the settings of its runs")
     runs = _runs_of(Path(table))
-    for name, settings in _settings_of(rest, list(runs)).items():
+    settings = _settings_of(rest, list(runs))
+    for name, lines in runs.items():
+        if {tuple(line.lane.items()) for line in lines} != {tuple(lane.items()) for lane in settings[name].lanes}:
+            raise SettingError(f"{name}: the table has other seeds or swept values than these settings")
+        if (options["out"] / name / CONFIG_FILE).exists():
+            raise SettingError(f"out={options['out']}: holds a run {name}; nothing is written over it")
+    for name, lines in runs.items():
         folder = options["out"] / name
-        _write(folder, dataclasses.replace(settings, run_dir=str(folder)), runs[name])
+        text = "".join(json.dumps(line.lane | line.numbers) + "\n" for line in lines)
+        files.write_together(folder, {METRICS_FILE: text.encode(), EPISODES_FILE: b""})
+        config.save(dataclasses.replace(settings[name], run_dir=str(folder)), folder)
         print(f"written: {folder}")
     return 0
 
 
-def _runs_of(table: Path) -> dict[str, list[Row]]:
-    """The table's rows by the name of their run, by rising steps.
+def _runs_of(table: Path) -> dict[str, list[Line]]:
+    """The lines of each run that the table has, by its name; by rising steps.
 
     Raises:
         SettingError: it is no table that `plot` writes.
@@ -60,8 +80,19 @@ def _runs_of(table: Path) -> dict[str, list[Row]]:
         raise SettingError(f"{table}: no table that can be read ({error})") from None
     if not rows or not {"run", "swept", "env_steps", "seed"} <= rows[0].keys():
         raise SettingError(f"{table}: no table of curves, as plot out=FILE.csv writes it")
-    rows.sort(key=lambda row: (row["run"], float(row["env_steps"])))
-    return {name: list(rows) for name, rows in itertools.groupby(rows, lambda row: row["run"])}
+    runs: dict[str, list[Line]] = {}
+    try:
+        for row in rows:
+            runs.setdefault(row.pop("run"), []).append(_line(**row))
+    except (ValueError, TypeError) as error:
+        raise SettingError(f"{table}: has a row that plot does not write ({error})") from None
+    return {name: sorted(lines, key=lambda line: line.numbers["env_steps"]) for name, lines in runs.items()}
+
+
+def _line(swept: str, env_steps: str, seed: str, **numbers: str) -> Line:
+    values = {name: float(value) for name, value in (word.split("=") for word in swept.split())}
+    others = {name: float(value) if value else None for name, value in numbers.items()}
+    return Line({"seed": int(seed), **values}, {"env_steps": int(env_steps), **others})
 
 
 def _settings_of(words: Sequence[str], names: Sequence[str]) -> dict[str, Settings]:
@@ -77,29 +108,6 @@ def _settings_of(words: Sequence[str], names: Sequence[str]) -> dict[str, Settin
         else:
             raise SettingError(f"{word} no such run in the table, which has {', '.join(names)}")
     return {name: config.compose([*shared, *more]) for name, more in own.items()}
-
-
-def _write(folder: Path, settings: Settings, rows: Sequence[Row]) -> None:
-    lines = [dict(_line(row)) for row in rows]
-    names = settings.lanes[0].keys()
-    if {tuple(map(line.get, names)) for line in lines} != {tuple(lane.values()) for lane in settings.lanes}:
-        raise SettingError(f"{folder.name}: the table has other seeds or swept values than these settings")
-    if (folder / CONFIG_FILE).exists():
-        raise SettingError(f"out={folder.parent}: holds a run {folder.name}; nothing is written over it")
-    text = "".join(json.dumps(line) + "\n" for line in lines)
-    files.write_together(folder, {METRICS_FILE: text.encode(), EPISODES_FILE: b""})
-    config.save(settings, folder)
-
-
-def _line(row: Row) -> Iterator[tuple[str, Any]]:
-    """A row as a line of metrics.jsonl has it."""
-    for name, value in row.items():
-        if name == "swept":
-            yield from ((key, float(number)) for key, number in (word.split("=") for word in value.split()))
-        elif name in ("env_steps", "seed"):
-            yield name, int(value)
-        elif name != "run":
-            yield name, float(value) if value else None
 
 
 if __name__ == "__main__":
