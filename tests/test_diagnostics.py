@@ -158,7 +158,7 @@ def test_the_entropy_of_later_actions_is_earned_as_well():
     assert found[0, 0] == pytest.approx((1 + 0.9 * 0.5 * 2) / 0.1)
 
 
-@pytest.mark.parametrize(("discount", "steps"), [(0.99, 459), (0.9, 44), (1.0, 1000), (0.0, 0)])
+@pytest.mark.parametrize(("discount", "steps"), [(0.99, 459), (0.998, 2301), (0.9, 44), (1.0, 3000), (0.0, 0)])
 def test_how_far_a_return_is_looked_at(discount, steps):
     assert diagnostics.tail(discount) == steps
 
@@ -212,12 +212,12 @@ def test_no_key_of_a_fresh_world_s_reset_is_one_of_its_actions_keys():
     assert not resets & {tuple(row) for row in np.asarray(jax.random.key_data(steps)).reshape(-1, 2)}
 
 
-def test_a_step_that_is_not_finite_ends_an_episode_before_it():
+def test_a_simulator_that_diverges_ends_an_episode_before_that():
     world = fresh.MjxWorld(probes.FailingProbe(), 8, seed=0)
     found = fresh.collect(world, lambda *_: (np.ones((8, 1)), np.zeros(8)), 9, jax.random.key(0))
     lengths = found.there.sum(axis=1)
     assert len(set(lengths.tolist())) > 1
-    assert all(np.isfinite(column).all() for column in found)
+    assert all((np.abs(column) < 1e10).all() for column in found)
     for there, length in zip(found.there, lengths, strict=True):
         np.testing.assert_array_equal(there, np.arange(9) < length)
 

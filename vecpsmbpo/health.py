@@ -16,7 +16,7 @@ import numpy as np
 
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import LARGEST_NUMBER, Health, SeedState, TrainState
+from vecpsmbpo.types import Health, SeedState, TrainState, possible
 
 # A code is a rank times `_WIDTH` plus the index of a member or model. Ranks are the entries of `PASSING` and then
 # the leaves of the state. Of several the smallest leaf is named; what passed by is as a rule its consequence.
@@ -75,11 +75,6 @@ def settle(layout: Layout, before: TrainState, after: TrainState) -> tuple[Train
     )
     seeds = held[0].replace(**seeds.rings(), health=health)
     return after.replace(seeds=seeds, env=held[1]), now
-
-
-def possible(x: jax.Array) -> jax.Array:
-    """Which numbers a simulator can mean: not those of one that has diverged, on its way to infinity or there."""
-    return jnp.abs(x) <= LARGEST_NUMBER  # False for NaN
 
 
 def sound(obs: jax.Array, reward: jax.Array, next_obs: jax.Array) -> jax.Array:

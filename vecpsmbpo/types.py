@@ -26,8 +26,13 @@ TerminationRule = Callable[
     [Float[Array, "*batch O"], Float[Array, "*batch A"], Float[Array, "*batch O"]], Bool[Array, "*batch"]
 ]
 
-# A simulator that gives a larger number has diverged: MuJoCo's own bound (mjMAXVAL) on what it computes with.
-LARGEST_NUMBER = 1e10
+LARGEST_NUMBER = 1e10  # MuJoCo's own bound (mjMAXVAL) on what it computes with
+
+
+def possible(x: Any) -> Any:
+    """Which numbers of an array a simulator can mean: not those of one that has diverged, on its way to infinity or
+    there."""
+    return abs(x) <= LARGEST_NUMBER  # False for NaN
 
 
 @dataclass(frozen=True)

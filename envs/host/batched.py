@@ -9,7 +9,7 @@ import numpy as np
 
 from vecpsmbpo import words
 from vecpsmbpo.settings import SettingError
-from vecpsmbpo.types import LARGEST_NUMBER, EnvSpec
+from vecpsmbpo.types import EnvSpec, possible
 
 
 class SimulatorError(SettingError):
@@ -93,7 +93,7 @@ class HostEnv:
     def step(self, actions: np.ndarray, still: np.ndarray | None = None) -> HostStep:
         """actions [B, A] in [-1, 1]; values outside are clipped, and NaN is 0.
 
-        A simulator that returns NaN, infinity or what is beyond `LARGEST_NUMBER` is reset.
+        A simulator that returns NaN, infinity or what is beyond 1e10 (`types.possible`) is reset.
 
         Args:
             still: [B] bool, simulators that are left as they are: nobody uses what they say.
@@ -118,8 +118,7 @@ class HostEnv:
             with np.errstate(over="ignore"):  # to infinity, which is looked for
                 reward = np.asarray(rewards, np.float64).astype(np.float32)
             terminated, cut = np.asarray(terminated, bool), np.asarray(cut, bool)
-        numbers = np.column_stack([self._obs, next_obs, reward])
-        sound = (np.abs(numbers) <= LARGEST_NUMBER).all(axis=1)  # False for NaN
+        sound = possible(np.column_stack([self._obs, next_obs, reward])).all(axis=1)
         terminated = terminated & sound
         self._lengths += ~still
         truncated = (cut | (self._lengths >= self.episode_length) | ~sound) & ~terminated & ~still

@@ -29,6 +29,7 @@ from vecpsmbpo.types import (
     SeedState,
     Transition,
     Whole,
+    possible,
 )
 
 
@@ -181,7 +182,7 @@ class Algorithm(ABC):
         Shapes: obs [O] -> action [A].
         """
         policy_key, uniform_key = jax.random.split(key)
-        obs = jnp.where(health.possible(obs), obs, 0.0)  # a simulator's mistake must not become the policy's
+        obs = jnp.where(possible(obs), obs, 0.0)  # a simulator's mistake must not become the policy's
         action, memory = self.choose(counters, state, obs, policy_key)
         return jnp.where(state.episode.random, self._random_action(state, uniform_key), action), memory
 
@@ -206,7 +207,7 @@ class Algorithm(ABC):
         """Stores a real transition (line 7); where it ends the episode, credits the member (line 15) and draws who acts
         in the next one (lines 1 and 3).
 
-        Where something in it is not possible (`health.possible`), the episode ends before it, truncated, with the
+        Where something in it is not possible (`types.possible`), the episode ends before it, truncated, with the
         return so far.
         """
         episode = state.episode
@@ -230,7 +231,7 @@ class Algorithm(ABC):
         random = counters.env_steps + 1 < self.settings.warmup_steps
         index, warmups = episode.index + 1, episode.warmups + random
         stored = self._unpack(row)
-        state = self.note_start(state, jnp.where(health.possible(transition.obs), transition.obs, stored.obs))
+        state = self.note_start(state, jnp.where(possible(transition.obs), transition.obs, stored.obs))
         running = episode.replace(episode_return=total, length=length)
         values = self.values(state.replace(episode=running))
         following = self._begin_episode(state.posterior, values, state.hyper, index, warmups, random, key)
@@ -254,7 +255,7 @@ class Algorithm(ABC):
         again; at a run's very first step there is none, and it is a row of zeros.
         """
         row = replay.pack(transition)
-        sound = jnp.all(health.possible(row))
+        sound = jnp.all(possible(row))
         return jnp.where(sound, row, state.newest), sound
 
     def _unpack(self, rows: jax.Array) -> Transition:

@@ -177,7 +177,7 @@ def calibration(residuals: Array) -> Calibration:
 # ── critics ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def tail(discount: float, most: int = 1000) -> int:
+def tail(discount: float, most: int = 3000) -> int:
     """Steps after which no more than `TAIL` of a return is left; `most` where that is further off."""
     return min(most, int(np.ceil(np.log(TAIL) / np.log(discount)))) if 0 < discount < 1 else most * (discount > 0)
 

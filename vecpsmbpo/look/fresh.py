@@ -10,6 +10,7 @@ import numpy as np
 from vecpsmbpo import envs
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import possible
 
 Array = np.ndarray
 # (step from 0, obs [E, O], key) -> actions [E, A] and their log-densities [E].
@@ -137,12 +138,13 @@ def collect(
         each: shows progress over the steps, as `rich.progress.track` does.
     """
     obs, columns = world.reset(), []
-    alive = np.isfinite(obs).all(axis=-1)
+    alive = possible(obs).all(axis=-1)
     for t in each(range(length)):
-        action, log_prob = (np.asarray(x) for x in act(t, np.nan_to_num(obs), jax.random.fold_in(key, t)))
+        sound = np.where(possible(obs), obs, 0).astype(obs.dtype)
+        action, log_prob = (np.asarray(x) for x in act(t, sound, jax.random.fold_in(key, t)))
         step = world.step(action)
-        # A step that is not finite is not believed, and ends the episode before it.
-        alive = alive & np.isfinite(step.reward) & np.isfinite(step.next_obs).all(axis=-1)
+        # A step in which the simulator diverged is not believed, and ends the episode before it.
+        alive = alive & possible(step.reward) & possible(step.next_obs).all(axis=-1)
         taken = (obs, action, log_prob, step.reward, step.next_obs, step.terminated)
         columns.append([*map(partial(_where, alive), taken), alive])
         alive = alive & ~step.terminated & ~step.truncated
