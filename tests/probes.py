@@ -83,7 +83,7 @@ def host(terminates: bool, *, num_envs: int, seed: int) -> HostEnv:
     return HostEnv(spec(terminates), [ProbeSimulator(terminates) for _ in range(num_envs)])
 
 
-# ── that return NaN or infinity now and then, at a reset or at a step ───────────────────────────────────────────
+# ── that diverge now and then, at a reset or at a step ──────────────────────────────────────────────────────────
 
 
 class FailingProbe(Probe):

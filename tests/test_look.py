@@ -39,14 +39,15 @@ def test_plot_draws_the_seeds_of_a_single_group_thin(mixed, tmp_path):
 def test_plot_writes_the_numbers(mixed, tmp_path):
     out = tmp_path / "curves.csv"
     assert cli.main(["plot", str(mixed[0]), "y=eval_return,critic_loss", f"out={out}"]) == 0
-    header, first, second, *_ = out.read_text().splitlines()
-    assert header == "run,swept,env_steps,seed,eval_return,critic_loss"
-    assert (first, second) == ("ops,,40,0,1,", "ops,,80,0,2,0.5")
+    header, first, second, *_, last = out.read_text().splitlines()
+    assert header == "run,swept,env_steps,seed,eval_return,critic_loss,frozen"  # the last where a lane is
+    assert (first, second, last) == ("ops,,40,0,1,,", "ops,,80,0,2,0.5,", "ops,,80,1,6,0.5,1")
 
 
 def test_a_table_of_curves_is_put_back_into_run_directories(tmp_path, capsys):
     """And drawn and compared as the runs that it is of: seeds, swept values, settings and gaps."""
     swept = [line for value in (0.0, 0.5) for line in looks.epochs([1, 2.5, 3], real_ratio=value)]
+    swept[-1]["frozen"] = True
     words = ["env=cartpole_swingup", "size=tiny"]
     made = [
         looks.write(tmp_path / "swept", swept, **{"sweep.real_ratio": "[0,0.5]"}),
@@ -67,11 +68,41 @@ def test_a_table_of_curves_is_put_back_into_run_directories(tmp_path, capsys):
     of_runs, of_table = compared
     assert "seconds" not in of_table[0]  # which comes last
     assert all(line.startswith(f"{part},") for line, part in zip(of_runs, of_table, strict=True))
-    for wrong, said in ((["ps:", "num_seeds=3"], "other seeds"), (["sp:"], "no such run"), ([], "other seeds")):
+    assert f"{back[0]}: seed 0, real_ratio 0.5 was frozen at step 120" in list(runs.warnings(runs.load_all(back)))
+
+
+def test_mistakes_in_what_is_put_back(tmp_path):
+    """A line each, and nothing is written."""
+    table, words = tmp_path / "a.csv", ["env=cartpole_swingup", "size=tiny"]
+    head = "run,swept,env_steps,seed,eval_return\n"
+    cases = {
+        "other seeds": (head + "a,,40,0,1\n", ["num_seeds=2"]),
+        "no such run": (head + "a,,40,0,1\n", ["b:", "seed=0"]),
+        "twice": (head + "a,,40,0,1\na,,40,0,2\n", []),
+        "goes to step 160": (head + "a,,160,0,1\n", []),
+        "no name of a directory": (head + "../a,,40,0,1\n", []),
+        "does not write": (head + "a,,40,zero,1\n", []),
+        "too short": (head + "a,,40\n", []),
+        "as plot out=FILE.csv": ("a,b\n1,2\n", []),
+        "holds a x": (head + "x,,40,0,1\n", []),
+    }
+    (tmp_path / "out" / "x").mkdir(parents=True)
+    for said, (text, more) in cases.items():
+        table.write_text(text)
         with pytest.raises(SettingError, match=said):
-            putback.main([str(tables[0]), f"out={tmp_path / 'more'}", *words, *wrong])
-    with pytest.raises(SettingError, match="nothing is written over"):
-        putback.main([str(tables[0]), f"out={tmp_path / 'back'}", *words, *own])
+            putback.main([str(table), f"out={tmp_path / 'out'}", *words, *more])
+    assert [path.name for path in (tmp_path / "out").rglob("*")] == ["x"]
+    with pytest.raises(SettingError, match="needs a table"):
+        putback.main([])
+
+
+def test_a_column_that_older_logs_lack_is_a_gap(tmp_path):
+    new = looks.write(tmp_path / "new", looks.epochs([1, 2, 3], eval_broken_off=1))
+    old = looks.write(tmp_path / "old", looks.epochs([1, 2, 3]), algo="sac")
+    out = tmp_path / "a.csv"
+    assert cli.main(["plot", str(new), str(old), "y=eval_broken_off", f"out={out}"]) == 0
+    assert [line.split(",")[-1] for line in out.read_text().splitlines()[1:]] == ["1", "1", "1", "", "", ""]
+    assert cli.main(["compare", str(new), str(old), "y=eval_broken_off", f"out={out}"]) == 0
 
 
 def test_plot_draws_over_published_curves(tmp_path):

@@ -78,8 +78,9 @@ def test_a_seed_that_was_frozen_before_it_had_a_value_is_left_out(tmp_path):
     (row,) = compare.table(found, looks.options())
     assert (len(row.scores["cartpole_swingup"]), row.frozen, row.cells["best"].value) == (2, 1, 4)
     assert list(runs.warnings(found)) == [
-        f"{one}: seed 1 was frozen at step 20, before its first evaluation: it is in no average of those"
+        f"{one}: seed 1 was frozen at step 20; no average has it, as it has no evaluation"
     ]
+    assert groups.averaged([group], "mean of", "band") == "mean of 2 seeds, band"
 
 
 def test_a_frozen_seed_counts_with_what_it_had_reached_and_a_slow_one_ends_the_curve(mixed):

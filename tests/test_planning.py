@@ -51,7 +51,7 @@ def test_a_plan_in_which_a_model_diverges_is_worth_nothing(key):
 
     def value(plans, key):
         best = -jnp.sum((plans - 0.5) ** 2, axis=(1, 2))
-        return jnp.where(plans[:, 0, 0] < 0, jnp.nan, jnp.where(plans[:, 1, 0] < 0, jnp.inf, best))
+        return jnp.where(plans[:, 0, 0] < 0, jnp.nan, jnp.where(plans[:, 1, 0] < 0, 1e20, best))
 
     found = planning.cross_entropy(value, jnp.zeros((2, 1)), key, settings)
     np.testing.assert_allclose(found, 0.5, atol=0.05)

@@ -8,19 +8,17 @@ name (`runs/fig5` has one of PS-MBPO, and ten seeds of OPS-MBPO):
 
     python tools/putback.py ... env=ball_in_cup size=cpu num_seeds=5 ball: num_seeds=10 ball_ps_mbpo: algo=ps_mbpo
 
-What a table does not have, its runs do not have either: there are no episodes, checkpoints and seconds to look at.
+What a table does not have, its runs do not have either: there are no episodes and checkpoints to look at.
 """
 
 import csv
 import dataclasses
-import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vecpsmbpo import arguments, config
-from vecpsmbpo.config import CONFIG_FILE
+from vecpsmbpo import arguments, config, jsonl
 from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE
 from vecpsmbpo.look import files
 from vecpsmbpo.settings import SettingError, Settings
@@ -28,7 +26,7 @@ from vecpsmbpo.settings import SettingError, Settings
 OPTIONS = {"out": arguments.out("where the run directories go", "runs/putback")}
 
 
-class Line(NamedTuple):
+class Epoch(NamedTuple):
     """A row of the table, as metrics.jsonl has it.
 
     Attributes:
@@ -36,8 +34,17 @@ class Line(NamedTuple):
         numbers: the others.
     """
 
-    lane: dict[str, Any]
-    numbers: dict[str, Any]
+    lane: jsonl.Line
+    numbers: jsonl.Line
+
+    @property
+    def name(self) -> str:
+        """The lane, as `plot` writes swept values: with six digits."""
+        return _name(self.lane)
+
+
+def _name(lane: Mapping[str, Any]) -> str:
+    return " ".join(f"{name}={float(value):g}" for name, value in lane.items())
 
 
 def main(words: Sequence[str]) -> int:
@@ -53,22 +60,43 @@ def main(words: Sequence[str]) -> int:
         raise SettingError("needs a table of curves, and the settings of its runs")
     runs = _runs_of(Path(table))
     settings = _settings_of(rest, list(runs))
-    for name, lines in runs.items():
-        if {tuple(line.lane.items()) for line in lines} != {tuple(lane.items()) for lane in settings[name].lanes}:
-            raise SettingError(f"{name}: the table has other seeds or swept values than these settings")
-        if (options["out"] / name / CONFIG_FILE).exists():
-            raise SettingError(f"out={options['out']}: holds a run {name}; nothing is written over it")
-    for name, lines in runs.items():
+    for name, epochs in runs.items():
+        _check(options["out"], name, settings[name], epochs)
+    for name, epochs in runs.items():
         folder = options["out"] / name
-        text = "".join(json.dumps(line.lane | line.numbers) + "\n" for line in lines)
+        # The values as the settings have them: the table has six digits of each.
+        lanes = {_name(lane): lane for lane in settings[name].lanes}
+        text = "".join(jsonl.text_of(_logged(lanes[epoch.name]) | epoch.numbers) for epoch in epochs)
         files.write_together(folder, {METRICS_FILE: text.encode(), EPISODES_FILE: b""})
         config.save(dataclasses.replace(settings[name], run_dir=str(folder)), folder)
         print(f"written: {folder}")
     return 0
 
 
-def _runs_of(table: Path) -> dict[str, list[Line]]:
-    """The lines of each run that the table has, by its name; by rising steps.
+def _logged(lane: Mapping[str, Any]) -> jsonl.Line:
+    return {name: jsonl.INFINITY if value == float("inf") else value for name, value in lane.items()}
+
+
+def _check(out: Path, name: str, settings: Settings, epochs: Sequence[Epoch]) -> None:
+    """That a run of the table can be put back as one of these settings.
+
+    Raises:
+        SettingError: it cannot.
+    """
+    if {epoch.name for epoch in epochs} != {_name(lane) for lane in settings.lanes}:
+        raise SettingError(f"{name}: the table has other seeds or swept values than these settings")
+    if len({(epoch.name, epoch.numbers[jsonl.STEP]) for epoch in epochs}) < len(epochs):
+        raise SettingError(f"{name}: the table has a step of a seed twice, as of two runs of this name")
+    if (last := epochs[-1].numbers[jsonl.STEP]) > settings.total_steps:
+        raise SettingError(f"{name}: total_steps={settings.total_steps}: the table goes to step {last}")
+    if name != Path(name).name:
+        raise SettingError(f"{name}: no name of a directory")
+    if (out / name).exists():
+        raise SettingError(f"out={out}: holds a {name}; nothing is written over it")
+
+
+def _runs_of(table: Path) -> dict[str, list[Epoch]]:
+    """The rows of each run that the table has, by its name; by rising steps.
 
     Raises:
         SettingError: it is no table that `plot` writes.
@@ -80,19 +108,21 @@ def _runs_of(table: Path) -> dict[str, list[Line]]:
         raise SettingError(f"{table}: no table that can be read ({error})") from None
     if not rows or not {"run", "swept", "env_steps", "seed"} <= rows[0].keys():
         raise SettingError(f"{table}: no table of curves, as plot out=FILE.csv writes it")
-    runs: dict[str, list[Line]] = {}
+    runs: dict[str, list[Epoch]] = {}
     try:
         for row in rows:
-            runs.setdefault(row.pop("run"), []).append(_line(**row))
+            if None in row.values():
+                raise ValueError("it is too short")
+            runs.setdefault(row.pop("run"), []).append(_epoch(**row))
     except (ValueError, TypeError) as error:
         raise SettingError(f"{table}: has a row that plot does not write ({error})") from None
-    return {name: sorted(lines, key=lambda line: line.numbers["env_steps"]) for name, lines in runs.items()}
+    return {name: sorted(epochs, key=lambda epoch: epoch.numbers[jsonl.STEP]) for name, epochs in runs.items()}
 
 
-def _line(swept: str, env_steps: str, seed: str, **numbers: str) -> Line:
+def _epoch(swept: str, env_steps: str, seed: str, **numbers: str) -> Epoch:
     values = {name: float(value) for name, value in (word.split("=") for word in swept.split())}
     others = {name: float(value) if value else None for name, value in numbers.items()}
-    return Line({"seed": int(seed), **values}, {"env_steps": int(env_steps), **others})
+    return Epoch({"seed": int(seed), **values}, {jsonl.STEP: int(env_steps), **others})
 
 
 def _settings_of(words: Sequence[str], names: Sequence[str]) -> dict[str, Settings]:

@@ -26,6 +26,7 @@ QUANTITIES = {
     "eval_return": Quantity("evaluation return"),
     "train_return": Quantity("return in training"),
     "eval_length": Quantity("length of evaluation episodes"),
+    "eval_broken_off": Quantity("evaluation episodes that were broken off"),
     "real_ratio": Quantity(
         "λ, the share of real data", "λ: the share of real rows in what policies learn from", "share", always=True
     ),

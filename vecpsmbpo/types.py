@@ -266,7 +266,7 @@ class SeedState(struct.PyTreeNode):
         memory: what acting remembers within an episode.
         own: what the algorithm knows besides.
         epoch_return, epoch_episodes: [], sum and number of the returns of the episodes that ended this epoch.
-        epoch_unsound: [], steps of this epoch at which the simulator returned something that is not finite.
+        epoch_unsound: [], steps of this epoch at which the simulator diverged (`possible`).
         health: whether the lane is frozen.
     """
 

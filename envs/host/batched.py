@@ -48,7 +48,8 @@ class HostStep(NamedTuple):
         terminated: [B] bool.
         truncated: [B] bool, the episode ended for another reason, as a rule its time limit.
         next_obs: [B, O] the true successors, also where an episode ended.
-        sound: [B] bool, the step's numbers are possible; where they are not, the episode was truncated.
+        sound: [B] bool, the step's numbers are possible; where they are not, the episode was truncated, unless it
+            stands still.
     """
 
     obs: np.ndarray
@@ -96,7 +97,7 @@ class HostEnv:
         A simulator that returns NaN, infinity or what is beyond 1e10 (`types.possible`) is reset.
 
         Args:
-            still: [B] bool, simulators that are left as they are: nobody uses what they say.
+            still: [B] bool, simulators that are left as they are, since nothing is learned from what they say.
 
         Raises:
             ValueError: `actions` has another shape.

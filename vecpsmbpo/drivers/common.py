@@ -102,12 +102,18 @@ class Driver(Protocol):
         """
 
     def evaluate(
-        self, state: TrainState, keys: jax.Array, episodes: int, stopping: Callable[[], bool] = never
+        self,
+        state: TrainState,
+        keys: jax.Array,
+        episodes: int,
+        stopping: Callable[[], bool] = never,
+        unwanted: np.ndarray | None = None,
     ) -> Returns:
         """Whole episodes of the evaluation policy, in environments of their own. keys [S].
 
         Args:
             stopping: is asked every few steps, in every process, whether to stop.
+            unwanted: [S] bool, lanes whose returns nobody will use, so that their simulators need not be stepped.
 
         Raises:
             SimulatorError: one failed.

@@ -137,9 +137,9 @@ class HostDriver:
                 step = int(before.counters.env_steps) + len(ends) + 1
                 whole = before.replace(seeds=before.seeds.replace(**state.seeds.rings()))
                 raise Interrupted(step, whole, _stacked(news), error) from error
-            state, now = self._settle(before, state)
+            state, frozen = self._settle(before, state)
             # Of the whole stride at once: to fetch what a step returns would be nine waits for the device at each.
-            ends, frozen = jax.tree.map(np.asarray, processes.here((ends, now)))
+            ends, frozen = jax.tree.map(np.asarray, processes.here((ends, frozen)))
             news += [end.replace(done=end.done & ~frozen) for end in ends]
         self._saved_env = None
         self._check_alike()
@@ -163,7 +163,12 @@ class HostDriver:
         return self.layout.everywhere(_packed(step), BY_SEED)
 
     def evaluate(
-        self, state: TrainState, keys: jax.Array, episodes: int, stopping: Callable[[], bool] = never
+        self,
+        state: TrainState,
+        keys: jax.Array,
+        episodes: int,
+        stopping: Callable[[], bool] = never,
+        unwanted: np.ndarray | None = None,
     ) -> Returns:
         seeds, obs_size = self.layout.num_lanes, self.algorithm.spec.obs_size
         split = split_for_episodes(keys, episodes)
@@ -176,7 +181,7 @@ class HostDriver:
         act, count = compiled_for or self._evaluation_actions, seeds * episodes
         memory = self.layout.everywhere(broadcast_leaves(self.algorithm.memory(), seeds, episodes), BY_SEED)
         total, length, broken_off = np.zeros(count), np.zeros(count, int), np.zeros(count, bool)
-        alive = ~broken_off
+        alive = np.ones(count, bool) if unwanted is None else np.repeat(~unwanted, episodes)
         for t in itertools.count():
             if not alive.any():
                 break
@@ -185,7 +190,7 @@ class HostDriver:
             states = self.layout.everywhere(obs.reshape(seeds, episodes, obs_size), BY_SEED)
             now = self.layout.everywhere(jnp.int32(t), SHARED)
             action, memory = act(policies, now, memory, states, split.actions)
-            step = _in_all(partial(env.step, np.asarray(processes.here(action)).reshape(count, -1)))
+            step = _in_all(partial(env.step, np.asarray(processes.here(action)).reshape(count, -1), still=~alive))
             obs = step.obs
             total += np.where(alive & step.sound, step.reward, 0.0)
             length += alive

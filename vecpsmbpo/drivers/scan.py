@@ -76,7 +76,12 @@ class ScanDriver:
         return state, flat
 
     def evaluate(
-        self, state: TrainState, keys: jax.Array, episodes: int, stopping: Callable[[], bool] = never
+        self,
+        state: TrainState,
+        keys: jax.Array,
+        episodes: int,
+        stopping: Callable[[], bool] = never,
+        unwanted: np.ndarray | None = None,
     ) -> Returns:
         compiled_for = self._compiled_evaluation if episodes == self.settings.eval_episodes else None
         start, go_on = compiled_for or (self._start, self._go_on)
@@ -148,7 +153,15 @@ class ScanDriver:
             count = keys.resets.shape[0]
             memory = broadcast_leaves(self.algorithm.memory(), count)
             env, zeros = jax.vmap(self._reset)(keys.resets), jnp.zeros(count)
-            begun = _Episodes(jnp.int32(0), memory, env, zeros, zeros.astype(int), zeros > 0, zeros == 0)
+            begun = _Episodes(
+                t=jnp.int32(0),
+                memory=memory,
+                env=env,
+                total=zeros,
+                length=zeros.astype(int),
+                broken_off=zeros > 0,
+                alive=zeros == 0,
+            )
             return self.algorithm.evaluation_policy(seed, keys.policy), begun
 
         return jax.vmap(one_seed)(seeds, keys)

@@ -64,7 +64,7 @@ class Row:
         env_steps: that were compared.
         scores: by task, the seeds' scores.
         cells: the numbers, by column.
-        frozen: how many of the seeds are frozen.
+        frozen: how many of the group's seeds are frozen, those included that have no score.
     """
 
     task: str
@@ -145,14 +145,13 @@ def _common_steps(here: Sequence[Group], asked: int) -> int:
 
 
 def _scores(group: Group, steps: int, options: dict[str, Any]) -> list[Seed]:
-    """Of its lanes, but for those that were frozen before they had a value."""
-    scores = [(score(lane, steps, options), lane.frozen) for lane in group.lanes]
-    return [seed for seed, frozen in scores if not (frozen and np.isnan(seed.final))] or [scores[0][0]]
+    lanes = [lane for lane in group.lanes if lane.counts(options["y"])] or group.lanes
+    return [score(lane, steps, options) for lane in lanes]
 
 
 def score(lane: Lane, steps: int, options: dict[str, Any]) -> Seed:
     """A lane's scores up to `steps`. A frozen one keeps the value that it had reached."""
-    at, values = lane.epochs["env_steps"], lane.epochs[options["y"]]
+    at, values = lane.epochs["env_steps"], lane.column(options["y"])
     kept = (at <= steps) & runs.known(values)
     at, values = at[kept], values[kept]
     if not len(values):
@@ -162,7 +161,7 @@ def score(lane: Lane, steps: int, options: dict[str, Any]) -> Seed:
         at, values = np.append(at, missing), np.append(values, np.full(len(missing), values[-1]))
     threshold = options["threshold"]
     reached = NAN if threshold is None else next((x for x, y in zip(at, values, strict=True) if y >= threshold), np.inf)
-    seconds = lane.epochs.get("seconds", np.full(len(lane.epochs["env_steps"]), NAN))
+    seconds = lane.column("seconds")
     seconds = seconds[(lane.epochs["env_steps"] <= steps) & runs.known(seconds)]
     return Seed(
         final=float(values[-options["window"] :].mean()),
@@ -302,7 +301,7 @@ def caption(rows: Sequence[Row], options: dict[str, Any]) -> str:
     if "seconds" in _columns(rows):
         parts.append("seconds: wall time of the program that a seed was in, with all other seeds in it; median.")
     if any(row.frozen for row in rows):
-        parts.append("A frozen seed counts as what it had reached.")
+        parts.append("A frozen seed counts as what it had reached, and where it had reached nothing not at all.")
     return " ".join(parts)
 
 

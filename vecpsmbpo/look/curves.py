@@ -9,7 +9,7 @@ from vecpsmbpo import logged
 from vecpsmbpo.config import closest
 from vecpsmbpo.look import statistics
 from vecpsmbpo.look.groups import Group
-from vecpsmbpo.look.runs import Columns, Lane, Run, known
+from vecpsmbpo.look.runs import Lane, Run, known
 from vecpsmbpo.settings import SettingError
 
 Array = np.ndarray
@@ -135,15 +135,9 @@ def joined(
     return Curve(group.name, grid, AVERAGES[average](seeds, axis=0), low, high, seeds)
 
 
-def numbers(epochs: Columns, name: str) -> Array:
-    """A column [T]; NaN where the log has none, or one of texts or lists."""
-    column = epochs.get(name)
-    return np.full(len(epochs["env_steps"]), np.nan) if column is None or column.ndim > 1 else column
-
-
 def _line(lane: Lane, x: str, y: str, smooth: int) -> tuple[Array, Array]:
     """Where a lane has a value, and the value."""
-    at, values = numbers(lane.epochs, x), numbers(lane.epochs, y)
+    at, values = lane.column(x), lane.column(y)
     there = known(at) & known(values)
     at, values = at[there], values[there]
     sums = np.cumsum(np.concatenate([[0.0], values]))

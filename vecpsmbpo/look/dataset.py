@@ -102,7 +102,7 @@ def _buffers(trained: "Trained") -> Iterator[Any]:
             np.asarray, replay.unpack(jnp.asarray(ring[rows % len(ring)]), spec.obs_size, spec.action_size)
         )
         if len(rows) > 1 and not np.array_equal(obs[-1], next_obs[-2]):
-            # The simulator returned something that is not finite, and D_E holds the row before it once more.
+            # The simulator diverged, and D_E holds the row before it once more.
             rows, obs, action, reward, next_obs = (x[:-1] for x in (rows, obs, action, reward, next_obs))
         last = np.arange(len(rows)) == len(rows) - 1
         yield EpisodeBuffer(

@@ -245,10 +245,11 @@ def draw_bars(experiment: Experiment) -> "Figure":
     for axis, task, here in panels:
         for index, (m, look) in enumerate(zip(sizes, style.looks(len(sizes), ordered=True), strict=True)):
             cells = [one for one in here if one.values["n_policies"] == m]
-            scores = [np.array([last_evaluations(lane) for lane in one.lanes]) for one in cells]
+            lanes = ([lane for lane in one.lanes if lane.counts("eval_return")] for one in cells)
+            scores = [np.array([last_evaluations(lane) for lane in each]) for each in lanes]
             errors = [np.std(x, ddof=1) / np.sqrt(len(x)) if len(x) > 1 else 0.0 for x in scores]
             at = [one.values["n_models"] + (index - (len(sizes) - 1) / 2) * width for one in cells]
-            means = [np.mean(x) for x in scores]
+            means = [np.mean(x) if len(x) else math.nan for x in scores]
             axis.bar(at, means, 0.92 * width, color=look.colour, yerr=errors, label=f"M = {m}", error_kw={"lw": 0.9})
         axis.set_title(style.literal(f"{task}: last {LAST} evaluations"))
         axis.set_xlabel("number of models N")

@@ -13,6 +13,7 @@ from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import possible
 
 Array = np.ndarray
+_RESETS = 2**31 - 1  # of keys: no step of an episode
 # (step from 0, obs [E, O], key) -> actions [E, A] and their log-densities [E].
 Act = Callable[[int, Array, jax.Array], tuple[Any, Any]]
 
@@ -70,9 +71,6 @@ class World(Protocol):
 def _programs(env: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Reset and step of a batch of an environment, compiled once for all worlds of it."""
     return jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
-
-
-_RESETS = 2**31 - 1  # no step of an episode
 
 
 class MjxWorld:
@@ -140,8 +138,8 @@ def collect(
     obs, columns = world.reset(), []
     alive = possible(obs).all(axis=-1)
     for t in each(range(length)):
-        sound = np.where(possible(obs), obs, 0).astype(obs.dtype)
-        action, log_prob = (np.asarray(x) for x in act(t, sound, jax.random.fold_in(key, t)))
+        seen = np.where(possible(obs), obs, 0).astype(obs.dtype)
+        action, log_prob = (np.asarray(x) for x in act(t, seen, jax.random.fold_in(key, t)))
         step = world.step(action)
         # A step in which the simulator diverged is not believed, and ends the episode before it.
         alive = alive & possible(step.reward) & possible(step.next_obs).all(axis=-1)

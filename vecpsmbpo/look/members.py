@@ -85,14 +85,12 @@ class Trained:
     def real_states(self, most: int, random: np.random.Generator) -> Array:
         """[..., O], some of the observations that real steps of D_E led to."""
         ring = self.state.real[self.index]
-        oldest = max(0, self.step - len(ring))
-        own = int(health.own_rows(self.state.health, self.step, self.run.settings.stride)[self.index])
-        return self._observations(ring, (oldest + random.permutation(max(own - oldest, 1)))[:most] % len(ring))
+        return self._observations(ring, random.permutation(min(self.step, len(ring)))[:most])
 
     def imagined_states(self, most: int, random: np.random.Generator) -> Array | None:
         """[..., O], some of the observations that imagined steps led to, of those that policies learn from now, of all
-        members; None where nothing is imagined."""
-        if not self.imagined_rows:
+        members; None where nothing is imagined, or the lane is frozen, whose rings hold what nobody learns from."""
+        if not self.imagined_rows or health.frozen(self.state.health)[self.index]:
             return None
         assert self.state.imagined is not None
         rings = self.state.imagined[self.index][self._members]

@@ -15,8 +15,8 @@ from vecpsmbpo import config, jsonl, logged
 from vecpsmbpo.algorithms.catalogue import of_algorithm
 from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE, SESSIONS_FILE
 from vecpsmbpo.look import compare, diagnose, films, groups, statistics
-from vecpsmbpo.look.curves import curve, numbers
-from vecpsmbpo.look.runs import Lane, Run, known
+from vecpsmbpo.look.curves import curve
+from vecpsmbpo.look.runs import Lane, Run, known, numbers
 from vecpsmbpo.settings import Settings
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def values(run: Run, name: str) -> list[float]:
 
 def _evaluated(run: Run) -> list[Lane]:
     """The lanes that have an evaluation return to show."""
-    return [lane for lane in run.lanes if known(numbers(lane.epochs, "eval_return")).any()]
+    return [lane for lane in run.lanes if known(lane.column("eval_return")).any()]
 
 
 def _scoring() -> dict[str, Any]:
@@ -283,7 +283,7 @@ def _add_settings(page: "Page", run: Run) -> None:
 
 
 def _at(lane: Lane, step: float) -> str:
-    found = numbers(lane.epochs, "eval_return")[lane.epochs["env_steps"] == step]
+    found = lane.column("eval_return")[lane.epochs["env_steps"] == step]
     return f"{found[0]:,.1f}" if len(found) and known(found[0]) else "–"
 
 

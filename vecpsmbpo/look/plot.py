@@ -85,7 +85,7 @@ def draw(found: list[runs.Run], options: dict[str, Any]) -> None:
             if y == "eval_return":
                 draw_references(axis, references)
         average = {"mean": "mean", "iqm": "interquartile mean"}[options["average"]]
-        note = groups.averaged(together, f"{average} of", "95% bootstrap band")
+        note = groups.averaged(together, f"{average} of", "95% bootstrap band", options["y"])
         style.title(figure, options["title"] or f"{task}: {note}")
         style.legend(figure, axes)
         style.save(figure, options["out"])
@@ -131,13 +131,14 @@ def write_csv(path: Path, found: Sequence[runs.Run], names: Sequence[str]) -> No
     Raises:
         SettingError: it cannot be written.
     """
+    names = (*names, "frozen") if any(lane.frozen for one in found for lane in one.lanes) else names
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("run", "swept", "env_steps", "seed", *names))
     for one in found:
         for lane in one.lanes:
             swept = " ".join(f"{name}={value:g}" for name, value in lane.values.items() if name != "seed")
-            columns = [lane.epochs[name] for name in ("env_steps", "seed", *names)]
+            columns = [lane.column(name) for name in ("env_steps", "seed", *names)]
             writer.writerows((one.name, swept, *map(_number, row)) for row in zip(*columns, strict=True))
     files.write_text(path, text.getvalue())
 

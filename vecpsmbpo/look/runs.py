@@ -68,6 +68,14 @@ class Lane:
         """Columns of episodes.jsonl, [E] each; `probs` [E, N·M]."""
         return self.run.of_lane(self.values)
 
+    def counts(self, name: str) -> bool:
+        """Whether averages of a column have it: not of a lane that was frozen before it had a value there."""
+        return not self.frozen or bool(known(self.column(name)).any())
+
+    def column(self, name: str) -> Array:
+        """Of its epochs, [T], as `numbers` has it."""
+        return numbers(self.epochs, name)
+
     def setting(self, name: str) -> Any:
         """The value that it has of a setting, swept or its run's; None where its algorithm has no such setting."""
         return self.values.get(name, getattr(self.run.settings, name, None))
@@ -192,9 +200,14 @@ def warnings(runs: Iterable[Run]) -> Iterator[str]:
             yield f"{run.path}: has come to step {run.env_steps:,} of {run.settings.total_steps:,}"
         for lane in run.lanes:
             if lane.frozen:
-                evaluated = known(lane.epochs.get("eval_return", np.empty(0))).any()
-                before = "" if evaluated else ", before its first evaluation: it is in no average of those"
+                before = "" if lane.counts("eval_return") else "; no average has it, as it has no evaluation"
                 yield f"{run.path}: {lane.name} was frozen at step {lane.epochs['env_steps'][-1]:.0f}{before}"
+
+
+def numbers(columns: Columns, name: str) -> Array:
+    """A column of metrics.jsonl, [L]; NaN where the log has none, or one of texts or lists."""
+    column = columns.get(name)
+    return np.full(len(columns["env_steps"]), np.nan) if column is None or column.ndim > 1 else column
 
 
 def known(values: Array) -> Array:

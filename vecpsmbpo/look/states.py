@@ -55,7 +55,7 @@ def visited(run: Run) -> Visited:
     rings = np.asarray(saved.state.seeds.real)
     oldest = max(0, saved.step - rings.shape[1])
     own = health.own_rows(saved.state.seeds.health, saved.step, run.settings.stride)
-    steps = [np.unique(np.linspace(oldest, max(last - 1, oldest), ROWS).astype(int)) for last in own]
+    steps = [np.unique(np.linspace(oldest, last - 1, min(ROWS, max(last - oldest, 0))).astype(int)) for last in own]
     size = driver.algorithm.spec.obs_size
     obs = np.concatenate([ring[at % len(ring), :size] for ring, at in zip(rings, steps, strict=True)])
     return Visited(run, np.concatenate(steps), obs)

@@ -264,7 +264,7 @@ class _Session:
         keys = evaluation_keys(settings, self.env_steps)
         self.to_evaluate = True  # in what is saved until it is done
         try:
-            returns = self.driver.evaluate(self.state, keys, settings.eval_episodes, self._asked_to_stop)
+            returns = self.driver.evaluate(self.state, keys, settings.eval_episodes, self._asked_to_stop, self.frozen)
         except Stopped:
             self._save()
             return
@@ -279,7 +279,7 @@ class _Session:
             self.checkpoints.amend(self.env_steps, known)
         self.display.epoch(self.env_steps, float(np.mean([line["eval_return"] for line in lines])))
         if unsound := sum(line["unsound_steps"] for line in lines):
-            self.display.say(sayings.unsound(self.settings, unsound, len(lines) * settings.epoch_steps))
+            self.display.say(sayings.unsound(settings, unsound, len(lines) * settings.epoch_steps))
         if broken_off := sum(line["eval_broken_off"] for line in lines):
             self.display.say(sayings.broken_off(settings, broken_off, len(lines) * settings.eval_episodes))
         epoch = self.env_steps // settings.epoch_steps

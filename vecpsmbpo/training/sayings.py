@@ -10,6 +10,7 @@ import jax
 from vecpsmbpo import config, versions
 from vecpsmbpo.envs import speeds
 from vecpsmbpo.settings import Settings
+from vecpsmbpo.types import LARGEST_NUMBER
 
 
 def introduction(settings: Settings, devices: list[str], memory: str, env_steps: int) -> Iterator[str]:
@@ -50,11 +51,11 @@ def frozen(settings: Settings, lane: int, step: int, what: str) -> str:
 
 
 def unsound(settings: Settings, steps: int, of_steps: int) -> str:
-    """Of a task whose simulator did at some steps of an epoch: also where it was once, since that is a fault, and not
-    so often as to hide anything else."""
+    """Of a task whose simulator diverged at some steps of an epoch: also where it was once, since that is a fault, and
+    not so often as to hide anything else."""
     return (
-        f"the simulator of {settings.task} diverged (NaN, infinity, or numbers beyond 1e10) at {steps} of {of_steps} "
-        "steps of this epoch; each of them ended its episode, and none is stored"
+        f"the simulator of {settings.task} diverged (NaN, infinity, or numbers beyond {LARGEST_NUMBER:g}) at {steps} "
+        f"of {of_steps} steps of this epoch; each of them ended its episode, and none is stored"
     )
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from vecpsmbpo import dynamics
 from vecpsmbpo.algorithms.pets.settings import PetsSettings
 from vecpsmbpo.networks import GaussianMLP
-from vecpsmbpo.types import EnvSpec, Model
+from vecpsmbpo.types import EnvSpec, Model, possible
 
 INITIAL_VARIANCE = 0.25  # of actions in [-1, 1]: (range / 4)²
 SMOOTHING = 0.1  # of what the distribution was before an iteration, kept
@@ -41,7 +41,7 @@ def cross_entropy(
         plans = mean + deviation * noise
         worth = value(plans, value_key)
         # Of a plan in which a model diverges nothing is known; `top_k` would put NaN first.
-        _, best = jax.lax.top_k(jnp.where(jnp.isfinite(worth), worth, -jnp.inf), settings.plan_elites)
+        _, best = jax.lax.top_k(jnp.where(possible(worth), worth, -jnp.inf), settings.plan_elites)
         elites = plans[best]
         mean = SMOOTHING * mean + (1 - SMOOTHING) * jnp.mean(elites, axis=0)
         variance = SMOOTHING * variance + (1 - SMOOTHING) * jnp.var(elites, axis=0)
