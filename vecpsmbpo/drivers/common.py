@@ -23,6 +23,9 @@ from vecpsmbpo.types import EpisodeEnd, Hyper, TrainState
 COMPILED_QUICKLY = {"xla_backend_optimization_level": 0}
 
 
+Stopping = Callable[[], bool]
+
+
 class Returns(NamedTuple):
     """Of evaluation episodes, [S, E] each.
 
@@ -102,12 +105,7 @@ class Driver(Protocol):
         """
 
     def evaluate(
-        self,
-        state: TrainState,
-        keys: jax.Array,
-        episodes: int,
-        stopping: Callable[[], bool] = never,
-        unwanted: np.ndarray | None = None,
+        self, state: TrainState, keys: jax.Array, episodes: int, stopping: Stopping = never, unwanted: Any = None
     ) -> Returns:
         """Whole episodes of the evaluation policy, in environments of their own. keys [S].
 

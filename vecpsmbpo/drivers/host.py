@@ -19,6 +19,7 @@ from vecpsmbpo.drivers.common import (
     Interrupted,
     Returns,
     Stopped,
+    Stopping,
     broadcast_leaves,
     compiled,
     evaluation_actions,
@@ -163,12 +164,7 @@ class HostDriver:
         return self.layout.everywhere(_packed(step), BY_SEED)
 
     def evaluate(
-        self,
-        state: TrainState,
-        keys: jax.Array,
-        episodes: int,
-        stopping: Callable[[], bool] = never,
-        unwanted: np.ndarray | None = None,
+        self, state: TrainState, keys: jax.Array, episodes: int, stopping: Stopping = never, unwanted: Any = None
     ) -> Returns:
         seeds, obs_size = self.layout.num_lanes, self.algorithm.spec.obs_size
         split = split_for_episodes(keys, episodes)

@@ -1,6 +1,5 @@
 """MJX environments: real steps, refits, rollouts and updates as one compiled program over the mesh."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +14,7 @@ from vecpsmbpo.drivers.common import (
     EpisodeKeys,
     Returns,
     Stopped,
+    Stopping,
     broadcast_leaves,
     compiled,
     evaluation_actions,
@@ -76,12 +76,7 @@ class ScanDriver:
         return state, flat
 
     def evaluate(
-        self,
-        state: TrainState,
-        keys: jax.Array,
-        episodes: int,
-        stopping: Callable[[], bool] = never,
-        unwanted: np.ndarray | None = None,
+        self, state: TrainState, keys: jax.Array, episodes: int, stopping: Stopping = never, unwanted: Any = None
     ) -> Returns:
         compiled_for = self._compiled_evaluation if episodes == self.settings.eval_episodes else None
         start, go_on = compiled_for or (self._start, self._go_on)
