@@ -27,23 +27,19 @@ OPTIONS = {"out": arguments.out("where the run directories go", "runs/putback")}
 
 
 class Epoch(NamedTuple):
-    """A row of the table, as metrics.jsonl has it.
+    """A row of the table.
 
     Attributes:
-        lane: its seed and swept values.
-        numbers: the others.
+        lane: its seed and swept values, as `_name` gives them.
+        numbers: the others, as metrics.jsonl has them.
     """
 
-    lane: jsonl.Line
+    lane: str
     numbers: jsonl.Line
-
-    @property
-    def name(self) -> str:
-        """The lane, as `plot` writes swept values: with six digits."""
-        return _name(self.lane)
 
 
 def _name(lane: Mapping[str, Any]) -> str:
+    """With six digits, as `plot` writes swept values."""
     return " ".join(f"{name}={float(value):g}" for name, value in lane.items())
 
 
@@ -66,7 +62,7 @@ def main(words: Sequence[str]) -> int:
         folder = options["out"] / name
         # The values as the settings have them: the table has six digits of each.
         lanes = {_name(lane): lane for lane in settings[name].lanes}
-        text = "".join(jsonl.text_of(_logged(lanes[epoch.name]) | epoch.numbers) for epoch in epochs)
+        text = "".join(jsonl.text_of(_logged(lanes[epoch.lane]) | epoch.numbers) for epoch in epochs)
         files.write_together(folder, {METRICS_FILE: text.encode(), EPISODES_FILE: b""})
         config.save(dataclasses.replace(settings[name], run_dir=str(folder)), folder)
         print(f"written: {folder}")
@@ -83,9 +79,9 @@ def _check(out: Path, name: str, settings: Settings, epochs: Sequence[Epoch]) ->
     Raises:
         SettingError: it cannot.
     """
-    if {epoch.name for epoch in epochs} != {_name(lane) for lane in settings.lanes}:
+    if {epoch.lane for epoch in epochs} != {_name(lane) for lane in settings.lanes}:
         raise SettingError(f"{name}: the table has other seeds or swept values than these settings")
-    if len({(epoch.name, epoch.numbers[jsonl.STEP]) for epoch in epochs}) < len(epochs):
+    if len({(epoch.lane, epoch.numbers[jsonl.STEP]) for epoch in epochs}) < len(epochs):
         raise SettingError(f"{name}: the table has a step of a seed twice, as of two runs of this name")
     if (last := epochs[-1].numbers[jsonl.STEP]) > settings.total_steps:
         raise SettingError(f"{name}: total_steps={settings.total_steps}: the table goes to step {last}")
@@ -122,7 +118,7 @@ def _runs_of(table: Path) -> dict[str, list[Epoch]]:
 def _epoch(swept: str, env_steps: str, seed: str, **numbers: str) -> Epoch:
     values = {name: float(value) for name, value in (word.split("=") for word in swept.split())}
     others = {name: float(value) if value else None for name, value in numbers.items()}
-    return Epoch({"seed": int(seed), **values}, {jsonl.STEP: int(env_steps), **others})
+    return Epoch(_name({"seed": int(seed), **values}), {jsonl.STEP: int(env_steps), **others})
 
 
 def _settings_of(words: Sequence[str], names: Sequence[str]) -> dict[str, Settings]:
