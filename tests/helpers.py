@@ -85,7 +85,7 @@ def environment(count: int | None = None) -> dict[str, str]:
 
 def check_log(run_dir: Path, settings) -> None:
     """Every epoch and episode of every lane exactly once, with every field."""
-    lanes = [tuple(metrics._lane(settings, index).items()) for index in range(len(settings.lanes))]
+    lanes = [tuple(metrics.lane_of(settings, index).items()) for index in range(len(settings.lanes))]
     names = [name for name, _ in lanes[0]]
 
     def of(lane, lines):

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vecpsmbpo import arguments, config, jsonl
+from vecpsmbpo import arguments, config, jsonl, metrics
 from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE
 from vecpsmbpo.look import files
 from vecpsmbpo.settings import SettingError, Settings
@@ -61,16 +61,12 @@ def main(words: Sequence[str]) -> int:
     for name, epochs in runs.items():
         folder = options["out"] / name
         # The values as the settings have them: the table has six digits of each.
-        lanes = {_name(lane): lane for lane in settings[name].lanes}
-        text = "".join(jsonl.text_of(_logged(lanes[epoch.lane]) | epoch.numbers) for epoch in epochs)
+        lanes = {_name(lane): metrics.lane_of(settings[name], index) for index, lane in enumerate(settings[name].lanes)}
+        text = "".join(jsonl.text_of(lanes[epoch.lane] | epoch.numbers) for epoch in epochs)
         files.write_together(folder, {METRICS_FILE: text.encode(), EPISODES_FILE: b""})
         config.save(dataclasses.replace(settings[name], run_dir=str(folder)), folder)
         print(f"written: {folder}")
     return 0
-
-
-def _logged(lane: Mapping[str, Any]) -> jsonl.Line:
-    return {name: jsonl.INFINITY if value == float("inf") else value for name, value in lane.items()}
 
 
 def _check(out: Path, name: str, settings: Settings, epochs: Sequence[Epoch]) -> None:

@@ -113,7 +113,7 @@ def episode_lines(news: EpisodeEnd, env_steps: int, settings: Settings) -> list[
         terminated = bool(news.terminated[step, seed])
         lines.append(
             {
-                **_lane(settings, seed),
+                **lane_of(settings, seed),
                 "episode": int(index),
                 "env_steps": env_steps + int(step) + 1,
                 "model": None if member < 0 else int(member) // settings.policies_per_model,
@@ -158,7 +158,7 @@ def epoch_lines(state: TrainState, algorithm: Algorithm) -> list[Line]:
         lines.append(
             {
                 "env_steps": int(state.counters.env_steps),
-                **_lane(settings, seed),
+                **lane_of(settings, seed),
                 "train_return": float(seeds.epoch_return[seed]) / episodes if episodes else None,
                 "train_episodes": int(episodes),
                 "unsound_steps": int(seeds.epoch_unsound[seed]),
@@ -171,7 +171,7 @@ def epoch_lines(state: TrainState, algorithm: Algorithm) -> list[Line]:
     return lines
 
 
-def _lane(settings: Settings, index: int) -> Line:
+def lane_of(settings: Settings, index: int) -> Line:
     """The seed and the swept values of a lane, by name."""
     return {name: _number(value) for name, value in settings.lanes[index].items()}
 
