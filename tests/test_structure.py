@@ -64,9 +64,10 @@ def test_modules_import_what_stands_to_their_left(graph):
     # Its table of names and its settings stand lower, as the text says.
     lower = re.compile(r"vecpsmbpo\.algorithms(\.catalogue|\.\w+\.settings|)$")
     ranked = {
-        name: next((rank[package] for package in rank if name == package or name.startswith(f"{package}.")), None)
+        name: 0
+        if lower.match(name)
+        else next((rank[package] for package in rank if name == package or name.startswith(f"{package}.")), None)
         for name in graph
-        if not lower.match(name)
     }
     wrong = [
         f"{name} imports {other}"

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from vecpsmbpo.algorithms.catalogue import TRACED
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings import Settings, fields
 
 # Signatures give shapes in these letters, `*batch` for any leading axes: Float[Array, "*batch O"]. Others (H, K, D) are
 # the function's own. Tests check them where functions are traced (tests/shapes.py); a run does not.
@@ -71,8 +70,8 @@ class Transition(NamedTuple):
 
 @jax.tree_util.register_pytree_with_keys_class
 class Hyper:
-    """What may be swept as a number: every setting that is marked `traced`, by its name. Scalars here and [S] in a
-    train state; None, and no leaf, where the algorithm has no such setting."""
+    """What may be swept as a number: every setting of the algorithm that is marked `traced`, by its name. Scalars here
+    and [S] in a train state. Checkpoints know their names and order."""
 
     def __init__(self, **values: Any):
         vars(self).update(values)
@@ -83,8 +82,7 @@ class Hyper:
 
     @classmethod
     def of(cls, settings: Settings) -> "Hyper":
-        values = {name: getattr(settings, name, None) for name in TRACED}
-        return cls(**{name: None if value is None else jnp.float32(value) for name, value in values.items()})
+        return cls(**{name: jnp.float32(getattr(settings, name)) for name in fields.traced(type(settings))})
 
     def replace(self, **values: Any) -> "Hyper":
         return Hyper(**{**vars(self), **values})

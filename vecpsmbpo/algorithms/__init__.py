@@ -34,7 +34,7 @@ TABLE = {
     "ops_mbpo": _PS_MBPO._replace(title="OPS-MBPO"),
     "ps_mbpo": _PS_MBPO,
     "mbpo": _PS_MBPO._replace(title="MBPO"),
-    "slbo": Entry("SLBO", SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo", format=5),
-    "pets": Entry("PETS", PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=5),
+    "slbo": Entry("SLBO", SlboSettings, "vecpsmbpo.algorithms.slbo.algorithm:Slbo", format=6),
+    "pets": Entry("PETS", PetsSettings, "vecpsmbpo.algorithms.pets.algorithm:Pets", format=6),
     "sac": _PS_MBPO._replace(title="SAC", settings=RealDataSettings),
 }

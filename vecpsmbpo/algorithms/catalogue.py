@@ -18,9 +18,8 @@ def of_algorithm(algo: str) -> dict[str, Any]:
 
 # Algorithms that have a setting of the same name mean the same by it.
 FIELDS = {name: field for algo in TABLE for name, field in of_algorithm(algo).items()}
-# Numbers inside the compiled program (`types.Hyper`). Checkpoints know their names and order: with others, those that
-# there are cannot be read.
-TRACED = tuple(name for name, field in FIELDS.items() if fields.is_traced(field))
+# Numbers inside the compiled program (`types.Hyper`), each once.
+TRACED = tuple(dict.fromkeys(name for entry in TABLE.values() for name in fields.traced(entry.settings)))
 
 
 def having(name: str) -> list[str]:

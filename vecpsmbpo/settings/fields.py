@@ -44,8 +44,9 @@ def choice(*names: str) -> Any:
     return dataclasses.field(metadata={"choices": names})
 
 
-def is_traced(field: Any) -> bool:
-    return field.metadata.get("traced", False)
+def traced(settings: type) -> list[str]:
+    """The settings of a class that are numbers inside the compiled program."""
+    return [field.name for field in dataclasses.fields(settings) if field.metadata.get("traced", False)]
 
 
 def allowed(field: Any) -> str:
