@@ -223,11 +223,24 @@ def _multirun(overrides: list[str]) -> int:
     return task.worst if task.in_order else _leave(task.worst)
 
 
+def _evaluation_options() -> dict[str, Any]:
+    """What `eval` may be told, as `arguments` has it; what is not said is as the run has it."""
+    from vecpsmbpo import arguments, config
+    from vecpsmbpo.algorithms.catalogue import allowed
+
+    return {
+        name: arguments.Option(word.what, None, str, allowed(word.setting)) for name, word in config.EVALUATION.items()
+    }
+
+
 def _eval(rest: list[str]) -> int:
-    from vecpsmbpo import config
+    from vecpsmbpo import arguments, config
     from vecpsmbpo.look import exported
 
-    run_dir, given = config.parse_evaluation(rest)
+    run_dirs, values = arguments.parse("eval", rest, _evaluation_options())
+    if len(run_dirs) != 1:
+        raise SettingError("run_dir: eval needs one directory that train or export has written")
+    [run_dir], given = run_dirs, {name: value for name, value in values.items() if value is not None}
     if policy := exported.load(run_dir) if exported.is_one(run_dir) else None:
         stored, settings = policy.settings, exported.for_evaluation(policy, given)
     else:
@@ -265,17 +278,13 @@ def _help(command: str = "") -> str:
     from importlib import resources
 
     from vecpsmbpo import arguments, config
-    from vecpsmbpo.algorithms.catalogue import FIELDS, allowed
+    from vecpsmbpo.algorithms.catalogue import FIELDS
 
     if command in MODULES:
         module = importlib.import_module(MODULES[command])
         return arguments.explain(command, module.__doc__ or "", module.OPTIONS)
     if command == "eval":
-        words = {
-            name: arguments.Option(word.what, None, str, allowed(word.setting))
-            for name, word in config.EVALUATION.items()
-        }
-        return arguments.explain(command, config.evaluation.__doc__ or "", words)
+        return arguments.explain(command, config.evaluation.__doc__ or "", _evaluation_options())
     plain = [name for name in FIELDS if name not in config.GROUPS]
     return HELP.format(
         groups="\n".join(

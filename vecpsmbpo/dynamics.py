@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from vecpsmbpo import networks, optim, replay
 from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings.parts import FitSettings
 from vecpsmbpo.types import EnvSpec, Hyper, Model, Moments, Params, Prior, Scaling, Transition, Whole
 
 VALIDATION_BATCH = 512
@@ -153,7 +154,7 @@ class Beta(NamedTuple):
     reward: float
 
     @classmethod
-    def of(cls, settings: Settings) -> "Beta":
+    def of(cls, settings: FitSettings) -> "Beta":
         return cls(settings.nll_beta, settings.reward_nll_beta)
 
 
@@ -217,7 +218,7 @@ def fit(
     key: PRNGKeyArray,
     *,
     net: networks.GaussianMLP,
-    settings: Settings,
+    settings: FitSettings,
     spec: EnvSpec,
 ) -> Model:
     """Trains until validation error has not fallen by `model_improvement` for `model_patience` epochs; keeps the

@@ -39,8 +39,10 @@ def evaluate(stored: Settings, settings: Settings) -> tuple[int, Returns]:
 def show(stored: Settings, settings: Settings) -> int:
     """Prints what `evaluate` finds; the exit status."""
     step, returns = evaluate(stored, settings)
-    who = f"policy: {settings.eval_policy}, {settings.eval_actions} actions"
-    title = f"{settings.task} ({settings.backend}) at step {step}, {who}"
+    title = f"{settings.task} ({settings.backend}) at step {step}"
+    for name in ("eval_policy", "eval_actions"):  # not every algorithm has them
+        if chosen := getattr(settings, name, ""):
+            title += f", {name.removeprefix('eval_')}: {chosen}"
     print_returns(title, zip(settings.lanes, returns.episode_return, returns.length, strict=True))
     if returns.broken_off.any():
         count, of_all = returns.broken_off.sum(), returns.broken_off.size

@@ -18,6 +18,7 @@ from vecpsmbpo.feedforward import Feedforward
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.networks import GaussianMLP
 from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings.parts import FitSettings
 from vecpsmbpo.types import (
     Counters,
     EnvSpec,
@@ -297,6 +298,7 @@ class Algorithm(ABC):
     def fit_models(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
         """Refits every model on D_E (Algorithm 1, line 2) where `enabled`."""
         settings = self.settings
+        assert isinstance(settings, FitSettings)  # of an algorithm that asks for this
         split_key, fit_key = jax.random.split(key)
         added = counters.env_steps
         split = dynamics.Split.draw(split_key, added, settings.replay_capacity, settings.validation_block)

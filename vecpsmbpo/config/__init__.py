@@ -2,7 +2,7 @@
 
 from vecpsmbpo.config.choices import GROUPS, closest, env_options, options
 from vecpsmbpo.config.composing import compose, compose_point, for_hydra, from_tree, hydra_errors
-from vecpsmbpo.config.evaluation import EVALUATION, for_evaluation, parse_evaluation
+from vecpsmbpo.config.evaluation import EVALUATION, for_evaluation
 from vecpsmbpo.config.overrides import chosen, parse
 from vecpsmbpo.config.resuming import resolve
 from vecpsmbpo.config.spelling import as_override, overrides_of
@@ -27,7 +27,6 @@ __all__ = [
     "options",
     "overrides_of",
     "parse",
-    "parse_evaluation",
     "resolve",
     "save",
 ]

@@ -4,7 +4,7 @@ What is not said is as the run has it.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from vecpsmbpo.algorithms.catalogue import allowed, check
@@ -28,23 +28,6 @@ EVALUATION = {
 }
 
 
-def parse_evaluation(overrides: Sequence[str]) -> tuple[str, dict[str, str]]:
-    """The `run_dir=` that is to be evaluated, and what else is said, by the names in `EVALUATION`.
-
-    Raises:
-        SettingError: there is no such name, or no `run_dir=`.
-    """
-    given: dict[str, str] = {}
-    for text in overrides:
-        name, equals, value = text.partition("=")
-        if not equals or name not in ("run_dir", *EVALUATION):
-            raise SettingError(f"{text}: eval takes run_dir=…, {'=…, '.join(EVALUATION)}=…")
-        given[name] = value
-    if "run_dir" not in given:
-        raise SettingError("run_dir: eval needs run_dir=…, a directory that train or export has written")
-    return given.pop("run_dir"), given
-
-
 def for_evaluation(stored: Settings, given: Mapping[str, Any]) -> Settings:
     """The settings of a run as it is to be evaluated.
 
@@ -59,6 +42,8 @@ def for_evaluation(stored: Settings, given: Mapping[str, Any]) -> Settings:
         if name not in EVALUATION:
             raise SettingError(f"{name}={value}: evaluation takes {', '.join(EVALUATION)}")
         setting = EVALUATION[name].setting
+        if not hasattr(stored, setting):
+            raise SettingError(f"{name}={value}: there is no choice with algo={stored.algo}")
         try:
             changes[setting] = check(setting, value)
         except SettingError:

@@ -213,7 +213,9 @@ def _evaluation_action(policy: Any, obs: Any, *, algorithm: Algorithm) -> jax.Ar
 
 def _evaluated(trained: Trained, who: str) -> Act:
     """The mean action of the policy that `eval_policy=who` evaluates, where there are no members to ask."""
-    settings = replace(trained.run.settings, eval_policy=who, eval_actions="mean")
+    wanted: dict[str, Any] = {"eval_policy": who, "eval_actions": "mean"}
+    settings = trained.run.settings
+    settings = replace(settings, **{name: value for name, value in wanted.items() if hasattr(settings, name)})
     algorithm = replace(trained.algorithm, settings=settings)
     chosen = trained.of_lane(evaluation_policies(algorithm)(trained.state, trained.state.key))
     return partial(_evaluation_action, chosen, algorithm=algorithm)

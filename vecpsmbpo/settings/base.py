@@ -46,8 +46,6 @@ class Settings:
     episode_length: int = whole(0)
     train_episode_length: int = whole(0)
     eval_episodes: int = whole(1, MOST_EPISODES)
-    eval_policy: str = choice("posterior", "best", "average")
-    eval_actions: str = choice("mean", "sampled")
     checkpoint_every: int = whole(1)
     keep_checkpoints: int = whole(1)
     report: bool
@@ -68,13 +66,7 @@ class Settings:
     model_weight_decay: float = real(0, traced=True)
     model_batch_size: int = whole(1, MOST_ROWS)
     model_update_every: int = whole(1)
-    model_patience: int = whole(1)
-    model_improvement: float = real(0, 1)
-    model_max_epochs: int = whole(1)
-    validation_ratio: float = real(0, 0.5, open_low=True)
     whiten_targets: bool
-    nll_beta: float = real(0, 1)
-    reward_nll_beta: float = real(0, 1)
     prior_scale: float = real(0, traced=True)
     # who acts
     forced_exploration: float = real(0, traced=True)
@@ -156,11 +148,6 @@ class Settings:
         """The first multiple of a period at which the warm-up is over."""
         return -(-self.warmup_steps // self.model_update_every) * self.model_update_every
 
-    @property
-    def validation_block(self) -> int:
-        """k, when one row in k validates: the split draws one row of every k consecutive ones."""
-        return round(1 / self.validation_ratio)
-
     def may_change(self, name: str) -> bool:
         """Whether a resumed run may be given another value of the setting `name`."""
         return name in CHANGEABLE
@@ -188,14 +175,6 @@ class Settings:
             lanes * self.eval_episodes > MOST_EPISODES,
             f"eval_episodes={self.eval_episodes}: at most {MOST_EPISODES} of all seeds together, not "
             f"{lanes * self.eval_episodes}",
-        )
-        yield (
-            not math.isclose(self.validation_block * self.validation_ratio, 1, rel_tol=1e-2),
-            f"validation_ratio={self.validation_ratio}: must be 1 / k for a whole number k, as one row in k validates",
-        )
-        yield (
-            self.warmup_steps < self.validation_block,
-            f"warmup_steps={self.warmup_steps}: must be at least 1 / validation_ratio = {self.validation_block}",
         )
         yield (
             self.replay_capacity < self.warmup_steps,

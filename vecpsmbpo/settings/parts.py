@@ -2,6 +2,7 @@
 algorithm's own class puts together those that it has."""
 
 import dataclasses
+import math
 from collections.abc import Iterator
 
 from vecpsmbpo.settings.base import MOST_LAYERS, MOST_ROWS, Settings
@@ -9,9 +10,38 @@ from vecpsmbpo.settings.fields import choice, real, whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class FitSettings(Settings):
+    """Of `dynamics.fit`, which ends where validation data say so (A.1)."""
+
+    model_patience: int = whole(1)
+    model_improvement: float = real(0, 1)
+    model_max_epochs: int = whole(1)
+    validation_ratio: float = real(0, 0.5, open_low=True)
+    nll_beta: float = real(0, 1)
+    reward_nll_beta: float = real(0, 1)
+
+    @property
+    def validation_block(self) -> int:
+        """k, when one row in k validates: the split draws one row of every k consecutive ones."""
+        return round(1 / self.validation_ratio)
+
+    def contradictions(self) -> Iterator[tuple[bool, str]]:
+        yield from super().contradictions()
+        yield (
+            not math.isclose(self.validation_block * self.validation_ratio, 1, rel_tol=1e-2),
+            f"validation_ratio={self.validation_ratio}: must be 1 / k for a whole number k, as one row in k validates",
+        )
+        yield (
+            self.warmup_steps < self.validation_block,
+            f"warmup_steps={self.warmup_steps}: must be at least 1 / validation_ratio = {self.validation_block}",
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PolicySettings(Settings):
     """Of learned policies."""
 
+    eval_actions: str = choice("mean", "sampled")
     policy_hidden_size: int = whole(1)
     policy_hidden_layers: int = whole(1, MOST_LAYERS)
 
@@ -60,6 +90,7 @@ class ImaginationSettings(SacSettings):
 class PosteriorSettings(Settings):
     """Of `posterior` and `mixing`: who acts, and from how much real data each learns."""
 
+    eval_policy: str = choice("posterior", "best", "average")
     n_policies: int = whole(1)
     real_ratio: float = real(0, 1, traced=True)
     real_ratio_schedule: str = choice("constant", "linear", "bandit")

@@ -3,12 +3,12 @@
 import dataclasses
 from collections.abc import Iterator
 
-from vecpsmbpo.settings import Settings
 from vecpsmbpo.settings.fields import choice, whole
+from vecpsmbpo.settings.parts import FitSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PetsSettings(Settings):
+class PetsSettings(FitSettings):
     """Of plans, made by the cross-entropy method over rollouts in the models."""
 
     rollout_models: str = choice("own", "any")

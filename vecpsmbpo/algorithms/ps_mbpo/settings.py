@@ -3,11 +3,11 @@
 import dataclasses
 from collections.abc import Iterator
 
-from vecpsmbpo.settings.parts import ImaginationSettings, PosteriorSettings
+from vecpsmbpo.settings.parts import FitSettings, ImaginationSettings, PosteriorSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PsMbpoSettings(PosteriorSettings, ImaginationSettings):
+class PsMbpoSettings(PosteriorSettings, ImaginationSettings, FitSettings):
     """Policies that learn by SAC from real and imagined data."""
 
     @property
@@ -39,4 +39,7 @@ class RealDataSettings(PsMbpoSettings):
             yield getattr(self, name) != 1, f"{name}={getattr(self, name)}: must be 1 with algo={self.algo}"
         moves = self.real_ratio_schedule != "constant" or "real_ratio" in dict(self.sweep)
         yield moves or self.real_ratio != 1, f"real_ratio: must be 1 with algo={self.algo}, and stay there"
+        for name, _ in self.sweep:
+            unused = name.startswith("model_") or name == "prior_scale"
+            yield unused, f"sweep.{name}: algo={self.algo} fits no model, so that its values would all do the same"
         yield from super().contradictions()
