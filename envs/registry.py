@@ -20,19 +20,23 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True)
 class Task:
-    """What `vecpsmbpo envs` lists of a task, and where its code is.
+    """What a task is, apart from its simulators, and where its code is.
 
     Attributes:
         suite: the importable package that holds the original.
         code: by backend, `module:attribute` below `vecpsmbpo.envs.<backend>`: a class of MJX ports or a function that
             makes one, and a function that makes a `HostEnv`. The backend that `auto` takes comes first.
+        original: what that function is told, to make this task's original.
         sizes: of this task; None for a whole suite, whose tasks are named by `env.*` options.
+        rewards: the least and the most of a step, where they are bounded.
         needs: what to give to `pip install`, where installing this package may leave the suite out.
     """
 
     suite: str
     code: dict[str, str] = field(hash=False)
+    original: dict[str, str] = field(default_factory=dict, hash=False)
     sizes: Sizes | None = None
+    rewards: tuple[float, float] | None = None
     needs: str | None = None
 
     @property
@@ -48,26 +52,29 @@ class Task:
 DM_CONTROL = "--no-deps dm-control==1.0.49"
 
 
-def _gymnasium(name: str, port: str, *sizes: int) -> Task:
-    return Task("gymnasium", {"mjx": f"{name}:{port}", "host": f"gymnasium:{name}"}, Sizes(*sizes))
+def _gymnasium(env_id: str, port: str, *sizes: int) -> Task:
+    code = {"mjx": port, "host": "gymnasium:original"}
+    return Task("gymnasium", code, {"id": env_id}, Sizes(*sizes))
 
 
-def _dm_control(name: str, port: str, *sizes: int) -> Task:
-    return Task("dm_control", {"mjx": port, "host": f"dm_control:{name}"}, Sizes(*sizes), needs=DM_CONTROL)
+def _dm_control(original: str, port: str, *sizes: int) -> Task:
+    domain, task = original.split()
+    code = {"mjx": port, "host": "dm_control:original"}
+    return Task("dm_control", code, {"domain": domain, "task": task}, Sizes(*sizes), (0.0, 1.0), DM_CONTROL)
 
 
 TASKS = {
-    "ant": _gymnasium("ant", "Ant", 27, 8, 1000),
-    "ball_in_cup": _dm_control("ball_in_cup", "ball_in_cup:BallInCup", 8, 2, 1000),
-    "cartpole_swingup": _dm_control("cartpole_swingup", "cartpole:CartpoleSwingup", 5, 1, 1000),
-    "cartpole_swingup_sparse": _dm_control("cartpole_swingup_sparse", "cartpole:CartpoleSwingupSparse", 5, 1, 1000),
-    "halfcheetah": _gymnasium("halfcheetah", "HalfCheetah", 17, 6, 1000),
-    "hopper": _gymnasium("hopper", "Hopper", 11, 3, 1000),
-    "walker2d": _gymnasium("walker2d", "Walker2d", 17, 6, 1000),
-    "window_open": Task("metaworld", {"host": "metaworld:window_open"}, Sizes(39, 4, 250)),
+    "ant": _gymnasium("Ant-v4", "ant:Ant", 27, 8, 1000),
+    "ball_in_cup": _dm_control("ball_in_cup catch", "ball_in_cup:BallInCup", 8, 2, 1000),
+    "cartpole_swingup": _dm_control("cartpole swingup", "cartpole:CartpoleSwingup", 5, 1, 1000),
+    "cartpole_swingup_sparse": _dm_control("cartpole swingup_sparse", "cartpole:CartpoleSwingupSparse", 5, 1, 1000),
+    "halfcheetah": _gymnasium("HalfCheetah-v4", "halfcheetah:HalfCheetah", 17, 6, 1000),
+    "hopper": _gymnasium("Hopper-v4", "hopper:Hopper", 11, 3, 1000),
+    "walker2d": _gymnasium("Walker2d-v4", "walker2d:Walker2d", 17, 6, 1000),
+    "window_open": Task("metaworld", {"host": "metaworld:window_open"}, sizes=Sizes(39, 4, 250), rewards=(-10.0, 0.0)),
     # any task of a suite, and anybody's own
     "gymnasium": Task("gymnasium", {"host": "gymnasium:any_task"}),
-    "dm_control": Task("dm_control", {"host": "dm_control:any_task"}, needs=DM_CONTROL),
+    "dm_control": Task("dm_control", {"host": "dm_control:any_task"}, rewards=(0.0, 1.0), needs=DM_CONTROL),
     "metaworld": Task("metaworld", {"host": "metaworld:any_task"}),
     "playground": Task("mujoco_playground", {"mjx": "playground:any_task"}, needs="'vecpsmbpo[playground]'"),
     "brax": Task("brax", {"mjx": "brax:any_task"}),
@@ -121,11 +128,12 @@ def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0, 
     backend = resolve_backend(name, backend)
     check_installed(name)
     module, attribute = TASKS[name].code[backend].split(":")
+    told = {**TASKS[name].original, **options, "name": name} if attribute == "original" else options
     which = " ".join([f"env={name}", *(f"env.{option}={value}" for option, value in options.items())])
     try:
         found = getattr(importlib.import_module(f"vecpsmbpo.envs.{backend}.{module}"), attribute)
         with contextlib.chdir("."):  # to come back: a task that goes elsewhere must not take the run's files along
-            made = found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **options)
+            made = found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **told)
         if min(made.spec.obs_size, made.spec.action_size) < 1:
             sizes = f"{made.spec.obs_size} observation(s) and {made.spec.action_size} action(s)"
             raise SettingError(f"{which}: has {sizes}; it must have at least one of each")

@@ -4,15 +4,10 @@ from vecpsmbpo.envs import termination
 from vecpsmbpo.envs.registry import TASKS
 from vecpsmbpo.types import EnvSpec
 
-_TERMINATION = {
-    "ant": termination.ant_leaves_its_height,
-    "hopper": termination.hopper_falls,
-    "walker2d": termination.walker_falls,
-}
-
 
 def get(name: str) -> EnvSpec:
     """The spec of one of the registry's own tasks."""
-    sizes = TASKS[name].sizes
-    assert sizes is not None, f"{name} is a suite, not a task"
-    return EnvSpec(name, *sizes, _TERMINATION.get(name, termination.never))
+    task = TASKS[name]
+    assert task.sizes is not None, f"{name} is a suite, not a task"
+    rule = termination.of_gymnasium(task.original["id"]) if task.suite == "gymnasium" else termination.never
+    return EnvSpec(name, *task.sizes, rule)

@@ -93,20 +93,6 @@ def _simulators(domain: str, task: str, num_envs: int, seed: int) -> list[DmCont
     return [DmControlSimulator(domain, task, seed + index) for index in range(num_envs)]
 
 
-def _of_paper(name: str, domain: str, task: str, num_envs: int, seed: int) -> HostEnv:
+def original(*, num_envs: int, seed: int, name: str, domain: str, task: str) -> HostEnv:
+    """`task` of `domain` as the task `name`, which has a port."""
     return HostEnv(specs.get(name), _simulators(domain, task, num_envs, seed))
-
-
-def ball_in_cup(*, num_envs: int, seed: int) -> HostEnv:
-    """ball_in_cup catch."""
-    return _of_paper("ball_in_cup", "ball_in_cup", "catch", num_envs, seed)
-
-
-def cartpole_swingup(*, num_envs: int, seed: int) -> HostEnv:
-    """cartpole swingup."""
-    return _of_paper("cartpole_swingup", "cartpole", "swingup", num_envs, seed)
-
-
-def cartpole_swingup_sparse(*, num_envs: int, seed: int) -> HostEnv:
-    """cartpole swingup_sparse."""
-    return _of_paper("cartpole_swingup_sparse", "cartpole", "swingup_sparse", num_envs, seed)

@@ -134,26 +134,6 @@ def batch(simulators: list[GymnasiumSimulator], name: str, limit: int, terminate
     return HostEnv(EnvSpec(name, obs.shape[0], action.shape[0], limit, terminated), simulators)
 
 
-def _of_paper(name: str, env_id: str, num_envs: int, seed: int) -> HostEnv:
-    env = any_task(num_envs=num_envs, seed=seed, id=env_id)
-    return HostEnv(specs.get(name), env.simulators)
-
-
-def ant(*, num_envs: int, seed: int) -> HostEnv:
-    """Ant-v4."""
-    return _of_paper("ant", "Ant-v4", num_envs, seed)
-
-
-def halfcheetah(*, num_envs: int, seed: int) -> HostEnv:
-    """HalfCheetah-v4."""
-    return _of_paper("halfcheetah", "HalfCheetah-v4", num_envs, seed)
-
-
-def hopper(*, num_envs: int, seed: int) -> HostEnv:
-    """Hopper-v4."""
-    return _of_paper("hopper", "Hopper-v4", num_envs, seed)
-
-
-def walker2d(*, num_envs: int, seed: int) -> HostEnv:
-    """Walker2d-v4."""
-    return _of_paper("walker2d", "Walker2d-v4", num_envs, seed)
+def original(*, num_envs: int, seed: int, name: str, id: str) -> HostEnv:
+    """The environment `id` as the task `name`, which has a port."""
+    return HostEnv(specs.get(name), any_task(num_envs=num_envs, seed=seed, id=id).simulators)

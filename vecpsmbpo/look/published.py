@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vecpsmbpo.envs.registry import TASKS
 from vecpsmbpo.settings import SettingError, Settings
 
 Array = np.ndarray
@@ -99,9 +100,7 @@ def scale(settings: Settings) -> tuple[float, float] | None:
     1 is the most possible where rewards are bounded (the control suite gives up to 1 a step, window-open takes up to
     10), and SAC's return after three million steps elsewhere.
     """
-    steps = float(settings.episode_length or 1000)
-    if settings.env == "window_open":
-        return -10.0 * steps, 0.0
-    if settings.env in ("ball_in_cup", "cartpole_swingup", "cartpole_swingup_sparse", "dm_control"):
-        return 0.0, steps
+    if rewards := TASKS[settings.env].rewards:
+        steps = float(settings.episode_length or 1000)
+        return rewards[0] * steps, rewards[1] * steps
     return (0.0, _SAC[settings.env].high) if settings.env in _SAC else None
