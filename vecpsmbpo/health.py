@@ -13,10 +13,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import Health, SeedState, TrainState, possible
+from vecpsmbpo.types import Flag, Health, SeedState, TrainState, Whole, possible
 
 # A code is a rank times `_WIDTH` plus the index of a member or model. Ranks are the entries of `PASSING` and then
 # the leaves of the state. Of several the smallest leaf is named; what passed by is as a rule its consequence.
@@ -33,7 +34,7 @@ def init() -> Health:
     return Health(code=nowhere, env_steps=jnp.int32(0), passing=nowhere)
 
 
-def note(health: Health, what: str, bad: jax.Array, member: jax.Array | int = 0) -> Health:
+def note(health: Health, what: str, bad: Flag, member: Whole = 0) -> Health:
     """Remembers, where `bad`, that `what` of `PASSING` was not finite."""
     code = jnp.where(bad, PASSING.index(what) * _WIDTH + member, NOWHERE)
     return health.replace(passing=jnp.minimum(health.passing, code))
@@ -77,8 +78,10 @@ def settle(layout: Layout, before: TrainState, after: TrainState) -> tuple[Train
     return after.replace(seeds=seeds, env=held[1]), now
 
 
-def sound(obs: jax.Array, reward: jax.Array, next_obs: jax.Array) -> jax.Array:
-    """Whether a step's numbers are possible: obs [..., O], reward [...], next_obs [..., O] -> bool [...]."""
+def sound(
+    obs: Float[Array, "*batch O"], reward: Float[Array, "*batch"], next_obs: Float[Array, "*batch O"]
+) -> Bool[Array, "*batch"]:
+    """Whether a step's numbers are possible."""
     return possible(obs).all(axis=-1) & possible(next_obs).all(axis=-1) & possible(reward)
 
 

@@ -5,14 +5,14 @@ from typing import Any
 import jax
 import optax
 
-from vecpsmbpo.types import Params
+from vecpsmbpo.types import Number, Params
 
 _adam = optax.scale_by_adam()
 init = _adam.init
 
 
 def step(
-    gradient: Params, optimizer: Any, params: Params, rate: jax.Array | float, *, decay: jax.Array | float | None = None
+    gradient: Params, optimizer: Any, params: Params, rate: Number, *, decay: Number | None = None
 ) -> tuple[Params, Any]:
     """The parameters one Adam step further, and the optimizer's new state.
 

@@ -54,7 +54,7 @@ def begin_stride(algorithm: Algorithm, state: TrainState) -> tuple[TrainState, j
     needed = algorithm.layout.any_seed(over_seeds(algorithm.refreshes)(counters, seeds))
     enabled = (into_period == 0) & learning & needed
 
-    def refresh(counters, state, key):
+    def refresh(counters, state, key):  # lines 2 and 8 to 10
         return algorithm.refresh(counters, state, enabled, key)
 
     counters, seeds = over_seeds(refresh, out_axes=(None, 0))(counters, seeds, keys[:, 0])
@@ -70,7 +70,10 @@ def observe_and_learn(
     keys: jax.Array,
     learning: jax.Array,
 ) -> tuple[Counters, SeedState, EpisodeEnd]:
-    """What follows every real step. transition leaves [S, ...], truncated [S], keys [S, 2]."""
+    """What follows every real step: lines 7, 15, 1 and 3, then 11 and 12.
+
+    Shapes: transition leaves [S, ...], truncated [S], keys [S, 2].
+    """
     seeds, end = over_seeds(algorithm.observe)(counters, seeds, transition, truncated, keys[:, 0])
     counters = counters._replace(env_steps=counters.env_steps + 1)
     # Only the agents go through the branch: a conditional that returned the buffers would copy them.

@@ -12,8 +12,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from vecpsmbpo import dynamics, health, posterior, replay
+from vecpsmbpo import dynamics, health, moments, posterior, replay
 from vecpsmbpo.feedforward import Feedforward
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.networks import GaussianMLP
@@ -24,8 +25,9 @@ from vecpsmbpo.types import (
     EnvSpec,
     Episode,
     EpisodeEnd,
+    Flag,
     Hyper,
-    Moments,
+    Number,
     Posterior,
     SeedState,
     Transition,
@@ -50,26 +52,28 @@ class Algorithm(ABC):
     # ── what an algorithm adds ───────────────────────────────────────────────────────────────────────────────
 
     @abstractmethod
-    def init_agent(self, key: jax.Array) -> Any:
+    def init_agent(self, key: PRNGKeyArray) -> Any:
         """One member; its sums over an epoch are in its `stats` (`types.Stats`)."""
 
     @abstractmethod
-    def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
-        """The acting member's action [A] for obs [O], and what it will remember at the episode's next step."""
+    def choose(
+        self, counters: Counters, state: SeedState, obs: Float[Array, " O"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, " A"], Any]:
+        """The acting member's action, and what it will remember at the episode's next step."""
 
     @abstractmethod
-    def evaluation_policy(self, state: SeedState, key: jax.Array) -> Any:
+    def evaluation_policy(self, state: SeedState, key: PRNGKeyArray) -> Any:
         """What `evaluation_action` needs of the state."""
 
     @abstractmethod
     def evaluation_action(
-        self, policy: Any, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, Any]:
-        """The action [A] for obs [O] at a step of an evaluation episode, from 0, and what it will remember."""
+        self, policy: Any, step: Int[Array, ""], memory: Any, obs: Float[Array, " O"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, " A"], Any]:
+        """The action at a step of an evaluation episode, from 0, and what it will remember."""
 
     @abstractmethod
     def refresh(
-        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+        self, counters: Counters, state: SeedState, enabled: Bool[Array, ""], key: PRNGKeyArray
     ) -> tuple[Counters, SeedState]:
         """What happens where a period of `model_update_every` steps begins; nothing where not `enabled`. The counters
         must not depend on the seed's state."""
@@ -102,33 +106,33 @@ class Algorithm(ABC):
         them, by name. Called on the host, with NumPy arrays, and without key, models, agents and rings."""
         return {}
 
-    def values(self, state: SeedState) -> jax.Array | None:
-        """[N·M] what each member promises, where `weights=values`, or None."""
+    def values(self, state: SeedState) -> Float[Array, " members"] | None:
+        """What each member promises, where `weights=values`, or None."""
         return None
 
     def draw(
-        self, earned: Posterior, values: jax.Array | None, hyper: Hyper, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Who acts in the episode that begins, [] int, and the distribution [N·M] that it was drawn from (line 3).
+        self, earned: Posterior, values: Float[Array, " members"] | None, hyper: Hyper, key: PRNGKeyArray
+    ) -> tuple[Int[Array, ""], Float[Array, " members"]]:
+        """Who acts in the episode that begins, and the distribution that it was drawn from (line 3).
 
         Args:
             earned: by each member.
-            values: of each, [N·M] or None.
+            values: of each, or None.
         """
         return jnp.int32(0), jnp.ones(self.settings.n_members)
 
-    def credit(self, state: SeedState, episode_return: jax.Array, enabled: jax.Array) -> SeedState:
-        """What the episode that ends earned, [], where `enabled`: added to what is known of the member that acted
+    def credit(self, state: SeedState, episode_return: Number, enabled: Flag) -> SeedState:
+        """What the episode that ends earned, where `enabled`: added to what is known of the member that acted
         (line 15)."""
         credited = posterior.credit(state.posterior, state.episode.member, episode_return, enabled)
         return state.replace(posterior=credited)
 
-    def refreshes(self, counters: Counters, state: SeedState) -> jax.Array:
-        """Whether there is anything to refresh for in the period that begins, [] bool."""
+    def refreshes(self, counters: Counters, state: SeedState) -> Bool[Array, ""]:
+        """Whether there is anything to refresh for in the period that begins."""
         return jnp.bool_(True)
 
-    def note_start(self, state: SeedState, obs: jax.Array) -> SeedState:
-        """Keeps what the algorithm wants of the observation [O] that a step of the running episode begins with."""
+    def note_start(self, state: SeedState, obs: Float[Array, " O"]) -> SeedState:
+        """Keeps what the algorithm wants of the observation that a step of the running episode begins with."""
         return state
 
     @property
@@ -140,18 +144,17 @@ class Algorithm(ABC):
         """How many of the newest rows that were imagined for a member it learns from after `env_steps` steps."""
         return 0
 
-    def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Any:
+    def learn(self, counters: Counters, state: SeedState, key: PRNGKeyArray) -> Any:
         """The agents after what is learned at every step."""
         return state.agents
 
     # ── init ─────────────────────────────────────────────────────────────────────────────────────────────────
 
-    def init(self, key: jax.Array, hyper: Hyper) -> SeedState:
+    def init(self, key: PRNGKeyArray, hyper: Hyper) -> SeedState:
         """The state before the first step. The first episode is a warm-up episode."""
         settings, spec, layout = self.settings, self.spec, self.layout
         key, model_key, agent_key, draw_key = jax.random.split(key, 4)
         earned = posterior.init(settings.n_members)
-        size = spec.obs_size + spec.action_size
         ring = replay.init(self.ring_capacity, spec.obs_size, spec.action_size)
         rings = jnp.broadcast_to(ring, (layout.member_ids().shape[0], *ring.shape))
         return SeedState(
@@ -164,7 +167,7 @@ class Algorithm(ABC):
             real=replay.init(settings.replay_capacity, spec.obs_size, spec.action_size),
             newest=jnp.zeros(ring.shape[1:]),
             imagined=rings if self.ring_capacity else None,
-            moments=_no_moments(size, spec.obs_size),
+            moments=moments.init(spec.obs_size, spec.action_size),
             posterior=earned,
             episode=self._begin_episode(earned, None, hyper, jnp.int32(1), jnp.int32(1), jnp.bool_(True), draw_key),
             memory=self.memory(),
@@ -177,17 +180,16 @@ class Algorithm(ABC):
 
     # ── act ──────────────────────────────────────────────────────────────────────────────────────────────────
 
-    def act(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
-        """The running episode's action, uniform in a random episode, and what is to be remembered.
-
-        Shapes: obs [O] -> action [A].
-        """
+    def act(
+        self, counters: Counters, state: SeedState, obs: Float[Array, " O"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, " A"], Any]:
+        """The running episode's action, uniform in a random episode, and what is to be remembered."""
         policy_key, uniform_key = jax.random.split(key)
         obs = jnp.where(possible(obs), obs, 0.0)  # a simulator's mistake must not become the policy's
         action, memory = self.choose(counters, state, obs, policy_key)
         return jnp.where(state.episode.random, self._random_action(state, uniform_key), action), memory
 
-    def _random_action(self, state: SeedState, key: jax.Array) -> jax.Array:
+    def _random_action(self, state: SeedState, key: PRNGKeyArray) -> jax.Array:
         """Uniform, [A]; drawn anew at every `random_hold`-th step of an episode, at others that of the step before."""
         action = jax.random.uniform(key, (self.spec.action_size,), minval=-1.0, maxval=1.0)
         if self.settings.random_hold == 1:
@@ -202,8 +204,8 @@ class Algorithm(ABC):
         counters: Counters,
         state: SeedState,
         transition: Transition,
-        truncated: jax.Array,
-        key: jax.Array,
+        truncated: Bool[Array, ""],
+        key: PRNGKeyArray,
     ) -> tuple[SeedState, EpisodeEnd]:
         """Stores a real transition (line 7); where it ends the episode, credits the member (line 15) and draws who acts
         in the next one (lines 1 and 3).
@@ -211,39 +213,21 @@ class Algorithm(ABC):
         Where something in it is not possible (`types.possible`), the episode ends before it, truncated, with the
         return so far.
         """
-        episode = state.episode
         row, sound = self._row(state, transition)
-        total = episode.episode_return + jnp.where(sound, transition.reward, 0.0)
-        length = episode.length + 1
-        terminated = (transition.terminated > 0) & sound
-        done = terminated | truncated | ~sound
-        end = EpisodeEnd(
-            done=done,
-            index=episode.index,
-            member=episode.member,
-            random=episode.random,
-            terminated=terminated,
-            episode_return=total,
-            length=length,
-            probs=episode.probs,
-            values=episode.values,
-        )
-        state = self.credit(state, total, done & ~episode.random)
-        random = counters.env_steps + 1 < self.settings.warmup_steps
-        index, warmups = episode.index + 1, episode.warmups + random
         stored = self._unpack(row)
-        state = self.note_start(state, jnp.where(possible(transition.obs), transition.obs, stored.obs))
-        running = episode.replace(episode_return=total, length=length)
-        values = self.values(state.replace(episode=running))
-        following = self._begin_episode(state.posterior, values, state.hyper, index, warmups, random, key)
-        state = state.replace(
+        end = _news(state.episode, transition, truncated, sound)
+        state = self.credit(state, end.episode_return, end.done & ~end.random)  # line 15
+        state = state.replace(  # line 7
             real=replay.add(state.real, row[None], counters.env_steps),
             newest=row,
-            moments=_welford(state.moments, stored, counters.env_steps),
-            episode=jax.tree.map(lambda a, b: jnp.where(done, a, b), following, running),
-            memory=jax.tree.map(partial(jnp.where, done), self.memory(), state.memory),
-            epoch_return=state.epoch_return + jnp.where(done, total, 0.0),
-            epoch_episodes=state.epoch_episodes + done,
+            moments=moments.add(state.moments, stored, counters.env_steps),
+        )
+        state = self.note_start(state, jnp.where(possible(transition.obs), transition.obs, stored.obs))
+        random = counters.env_steps + 1 < self.settings.warmup_steps
+        state = self._go_on(state, end, random, key)  # lines 1 and 3
+        state = state.replace(
+            epoch_return=state.epoch_return + jnp.where(end.done, end.episode_return, 0.0),
+            epoch_episodes=state.epoch_episodes + end.done,
             epoch_unsound=state.epoch_unsound + ~sound,
             health=health.note(state.health, health.ACTION, ~jnp.all(jnp.isfinite(transition.action))),
         )
@@ -262,15 +246,26 @@ class Algorithm(ABC):
     def _unpack(self, rows: jax.Array) -> Transition:
         return replay.unpack(rows, self.spec.obs_size, self.spec.action_size)
 
+    def _go_on(self, state: SeedState, end: EpisodeEnd, random: Flag, key: PRNGKeyArray) -> SeedState:
+        """The running episode, or where it has ended the next one, whose actions are `random` within the warm-up."""
+        running = state.episode.replace(episode_return=end.episode_return, length=end.length)
+        values = self.values(state.replace(episode=running))
+        index, warmups = running.index + 1, running.warmups + random
+        following = self._begin_episode(state.posterior, values, state.hyper, index, warmups, random, key)
+        return state.replace(
+            episode=jax.tree.map(partial(jnp.where, end.done), following, running),
+            memory=jax.tree.map(partial(jnp.where, end.done), self.memory(), state.memory),
+        )
+
     def _begin_episode(
         self,
         earned: Posterior,
         values: jax.Array | None,
         hyper: Hyper,
-        index: jax.Array,
-        warmups: jax.Array,
-        random: jax.Array,
-        key: jax.Array,
+        index: Int[Array, ""],
+        warmups: Int[Array, ""],
+        random: Flag,
+        key: PRNGKeyArray,
     ) -> Episode:
         member, probs = self.draw(earned, values, hyper, key)
         after_warmup = jnp.maximum(index - warmups, 1)
@@ -295,7 +290,9 @@ class Algorithm(ABC):
             epoch_unsound=cleared(state.epoch_unsound),
         )
 
-    def fit_models(self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array) -> SeedState:
+    def fit_models(
+        self, counters: Counters, state: SeedState, enabled: Bool[Array, ""], key: PRNGKeyArray
+    ) -> SeedState:
         """Refits every model on D_E (Algorithm 1, line 2) where `enabled`."""
         settings = self.settings
         assert isinstance(settings, FitSettings)  # of an algorithm that asks for this
@@ -316,21 +313,17 @@ class Algorithm(ABC):
         return state.replace(models=jax.lax.cond(enabled, fitted, lambda models: models, state.models))
 
 
-def _no_moments(inputs: int, obs_size: int) -> Moments:
-    """Of no rows."""
-    zeros, zero = jnp.zeros(inputs + obs_size + 1), jnp.zeros(())
-    return Moments(zeros, zeros, lowest_reward=zero, highest_reward=zero, inputs=inputs)
-
-
-def _welford(moments: Moments, transition: Transition, added: jax.Array) -> Moments:
-    """Moments of one more row after `added` of them."""
-    obs, action, reward, next_obs, _ = transition
-    value = jnp.concatenate([obs, action, next_obs - obs, reward[None]])
-    change = value - moments.mean
-    mean = moments.mean + change / (added + 1)
-    return moments.replace(
-        mean=mean,
-        deviation=moments.deviation + change * (value - mean),
-        lowest_reward=jnp.minimum(moments.lowest_reward, reward),
-        highest_reward=jnp.maximum(moments.highest_reward, reward),
+def _news(episode: Episode, transition: Transition, truncated: Flag, sound: Flag) -> EpisodeEnd:
+    """Of the step that `transition` is; its reward counts where it is `sound`."""
+    terminated = (transition.terminated > 0) & sound
+    return EpisodeEnd(
+        done=terminated | truncated | ~sound,
+        index=episode.index,
+        member=episode.member,
+        random=episode.random,
+        terminated=terminated,
+        episode_return=episode.episode_return + jnp.where(sound, transition.reward, 0.0),
+        length=episode.length + 1,
+        probs=episode.probs,
+        values=episode.values,
     )

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.pets import planning
@@ -25,30 +26,32 @@ class Pets(Algorithm):
 
     settings: PetsSettings
 
-    def init_agent(self, key: jax.Array) -> Planner:
+    def init_agent(self, key: PRNGKeyArray) -> Planner:
         return Planner(stats=Stats.zero())
 
-    def memory(self) -> jax.Array:
-        """The plan [H, A], whose first action is taken now: of the middle of every range."""
+    def memory(self) -> Float[Array, "H A"]:
+        """The plan, whose first action is taken now: of the middle of every range."""
         return jnp.zeros((self.settings.plan_horizon, self.spec.action_size))
 
-    def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+    def choose(
+        self, counters: Counters, state: SeedState, obs: Float[Array, " O"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, " A"], Any]:
         """The first action of the plan. Nothing is planned during the warm-up, when actions are random."""
         steps = counters.env_steps
         due = (steps % self.settings.plan_hold == 0) & (steps >= self.settings.warmup_steps)
         return self._follow(due, self.layout.all_models(state.models), state.memory, obs, key)
 
-    def evaluation_policy(self, state: SeedState, key: jax.Array) -> Model:
+    def evaluation_policy(self, state: SeedState, key: PRNGKeyArray) -> Model:
         return self.layout.all_models(state.models)
 
     def evaluation_action(
-        self, policy: Model, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, Any]:
+        self, policy: Model, step: Int[Array, ""], memory: Any, obs: Float[Array, " O"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, " A"], Any]:
         """As `choose`: planning is the same in training and evaluation."""
         return self._follow(step % self.settings.plan_hold == 0, policy, memory, obs, key)
 
     def refresh(
-        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+        self, counters: Counters, state: SeedState, enabled: Bool[Array, ""], key: PRNGKeyArray
     ) -> tuple[Counters, SeedState]:
         return counters, self.fit_models(counters, state, enabled, key)
 
@@ -59,9 +62,14 @@ class Pets(Algorithm):
         return 0, len(learning) * rollouts * settings.plan_horizon
 
     def _follow(
-        self, due: jax.Array, models: Model, plan: jax.Array, obs: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """The action for obs [O] and the plan [H, A]; a new one where `due`, which must not be batched over seeds or
+        self,
+        due: Bool[Array, ""],
+        models: Model,
+        plan: Float[Array, "H A"],
+        obs: Float[Array, " O"],
+        key: PRNGKeyArray,
+    ) -> tuple[Float[Array, " A"], Float[Array, "H A"]]:
+        """The action and the plan; a new one where `due`, which must not be batched over seeds or
         episodes: a batched condition would plan always."""
         settings = self.settings
         earned = partial(planning.expected_returns, net=self.model_net, settings=settings, spec=self.spec)

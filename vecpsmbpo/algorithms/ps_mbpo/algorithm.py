@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from vecpsmbpo import feedforward, health, imagination, mixing, posterior, replay, sac
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.algorithms.ps_mbpo.settings import PsMbpoSettings
 from vecpsmbpo.feedforward import Feedforward
 from vecpsmbpo.sac import Agent
-from vecpsmbpo.types import Counters, Hyper, Params, Posterior, SeedState, Transition, Whole
+from vecpsmbpo.types import Counters, Flag, Hyper, Number, Params, Posterior, SeedState, Transition, Whole
 
 
 class PsMbpoState(struct.PyTreeNode):
@@ -41,14 +42,14 @@ class PsMbpo(Algorithm):
     def nets(self) -> sac.Networks:
         return sac.make_networks(self.settings, self.spec)
 
-    def init_agent(self, key: jax.Array) -> Agent:
+    def init_agent(self, key: PRNGKeyArray) -> Agent:
         return sac.init(key, self.nets, self.spec)
 
     @property
     def ring_capacity(self) -> int:
         return imagination.ring_capacity(self.settings) if self.settings.imagines else 0
 
-    def retained_rows(self, env_steps: Whole) -> jax.Array:
+    def retained_rows(self, env_steps: Whole) -> Whole:
         return imagination.retained_rows(self.settings, env_steps)
 
     def working_bytes(self, row: int) -> int:
@@ -59,7 +60,7 @@ class PsMbpo(Algorithm):
             return minibatches
         return max(minibatches, imagination.batch_size(settings) * (2 * row + 8 * settings.model_hidden_size))
 
-    def init(self, key: jax.Array, hyper: Hyper) -> SeedState:
+    def init(self, key: PRNGKeyArray, hyper: Hyper) -> SeedState:
         state, settings = super().init(key, hyper), self.settings
         if settings.weighs_values:
             unknown = jnp.zeros(settings.n_members)  # no episode has begun yet
@@ -79,13 +80,13 @@ class PsMbpo(Algorithm):
     # ── who acts: once an episode ────────────────────────────────────────────────────────────────────────────
 
     def draw(
-        self, earned: Posterior, values: jax.Array | None, hyper: Hyper, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+        self, earned: Posterior, values: Float[Array, " members"] | None, hyper: Hyper, key: PRNGKeyArray
+    ) -> tuple[Int[Array, ""], Float[Array, " members"]]:
         """A member by equation 18 or 19; with `posterior=average` none, -1."""
         member, probs = posterior.draw(posterior.logits(earned, values, hyper.temperature), key)
         return jnp.int32(-1) if self.settings.averages_members else member, probs
 
-    def credit(self, state: SeedState, episode_return: jax.Array, enabled: jax.Array) -> SeedState:
+    def credit(self, state: SeedState, episode_return: Number, enabled: Flag) -> SeedState:
         """To the member (equation 19) and, where λ is chosen online, to the λ that it learned with."""
         bandit = state.own.bandit
         if bandit is not None:
@@ -95,20 +96,22 @@ class PsMbpo(Algorithm):
             state = state.replace(own=state.own.replace(bandit=known))
         return super().credit(state, episode_return, enabled)
 
-    def note_start(self, state: SeedState, obs: jax.Array) -> SeedState:
+    def note_start(self, state: SeedState, obs: Float[Array, " O"]) -> SeedState:
         starts = posterior.add_start(state.own.starts, state.episode, obs)
         return state.replace(own=state.own.replace(starts=starts))
 
     # ── act ──────────────────────────────────────────────────────────────────────────────────────────────────
 
-    def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+    def choose(
+        self, counters: Counters, state: SeedState, obs: Float[Array, " O"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, " A"], Any]:
         """An action sampled from the policy of the episode's member, or with `posterior=average` from all members'."""
         actors = state.agents.actor
         if self.settings.averages_members:
             return self._of_mixture(actors, obs, key), ()
         return self._of_member(state.episode.member, actors, obs, key), ()
 
-    def evaluation_policy(self, state: SeedState, key: jax.Array) -> Params:
+    def evaluation_policy(self, state: SeedState, key: PRNGKeyArray) -> Params:
         """Parameters for `evaluation_action`, by `eval_policy`: of the member that the posterior would pick now, of the
         member that has earned the most per episode, or of all members."""
         if self._evaluates_all:
@@ -120,8 +123,8 @@ class PsMbpo(Algorithm):
         return self.layout.select_member(member, state.agents.actor)
 
     def evaluation_action(
-        self, policy: Params, step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, Any]:
+        self, policy: Params, step: Int[Array, ""], memory: Any, obs: Float[Array, " O"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, " A"], Any]:
         """The mean action or a sample of it: of the member chosen; with `posterior=average` of a member drawn at every
         step, as `choose` does; with `eval_policy=average` the average of all members' mean actions."""
         sampled = self.settings.eval_actions == "sampled"
@@ -137,8 +140,8 @@ class PsMbpo(Algorithm):
         layers = feedforward.dense_layers(policy["params"]["ReluMLP_0"])
         return Feedforward(feedforward.first_outputs(layers, self.spec.action_size))
 
-    def values(self, state: SeedState) -> jax.Array | None:
-        """[N·M] min(Q_1, Q_2) of each member's mean action, averaged over the starts of the last episodes.
+    def values(self, state: SeedState) -> Float[Array, " members"] | None:
+        """min(Q_1, Q_2) of each member's mean action, averaged over the starts of the last episodes.
 
         The paper offers value functions in place of accumulated returns (section 3.3, after Agarwal and Zhang, 2022):
         what a member expects to earn, in its own model's world, rather than what it has earned. Members are comparable
@@ -187,12 +190,12 @@ class PsMbpo(Algorithm):
 
     # ── refresh: every `model_update_every` steps ────────────────────────────────────────────────────────────
 
-    def real_ratios(self, counters: Counters, state: SeedState) -> jax.Array:
-        """[N·M] the λ of each member now."""
+    def real_ratios(self, counters: Counters, state: SeedState) -> Float[Array, " members"]:
+        """The λ of each member now."""
         return mixing.real_ratios(self.settings, state.hyper, state.own.bandit, counters.env_steps)
 
-    def refreshes(self, counters: Counters, state: SeedState) -> jax.Array:
-        """Whether any member may learn from imagined data, [] bool, in the period that begins: λ may fall from 1 within
+    def refreshes(self, counters: Counters, state: SeedState) -> Bool[Array, ""]:
+        """Whether any member may learn from imagined data in the period that begins: λ may fall from 1 within
         it, and what is then drawn from must be there. Who learns from real data alone (λ = 1, equation 15) needs no
         models."""
         if self.settings.adapts_real_ratio or not self.settings.imagines:
@@ -201,7 +204,7 @@ class PsMbpo(Algorithm):
         return jnp.any(self.real_ratios(last, state) < 1)
 
     def refresh(
-        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+        self, counters: Counters, state: SeedState, enabled: Bool[Array, ""], key: PRNGKeyArray
     ) -> tuple[Counters, SeedState]:
         """Refits the models and renews the imagined data (Algorithm 1, lines 2 and 8 to 10)."""
         if not self.settings.imagines:
@@ -211,7 +214,7 @@ class PsMbpo(Algorithm):
         return self.imagine(counters, state, enabled, imagine_key)
 
     def imagine(
-        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+        self, counters: Counters, state: SeedState, enabled: Bool[Array, ""], key: PRNGKeyArray
     ) -> tuple[Counters, SeedState]:
         """Rolls every member (n, m) out in model n from real states (lines 9 and 10), into its own ring.
 
@@ -264,7 +267,7 @@ class PsMbpo(Algorithm):
 
     # ── learn: every step ────────────────────────────────────────────────────────────────────────────────────
 
-    def learn(self, counters: Counters, state: SeedState, key: jax.Array) -> Agent:
+    def learn(self, counters: Counters, state: SeedState, key: PRNGKeyArray) -> Agent:
         """The agents after G SAC updates of every member on λ D_E + (1 - λ) D_M^{n,m} (lines 11 and 12)."""
         settings, layout, nets = self.settings, self.layout, self.nets
         batch_key, update_key = jax.random.split(key)
@@ -294,12 +297,17 @@ class PsMbpo(Algorithm):
         return updates, int(np.sum(rows)) * settings.n_members
 
     def minibatches(
-        self, counters: Counters, state: SeedState, imagined: jax.Array | None, real_ratio: jax.Array, key: jax.Array
+        self,
+        counters: Counters,
+        state: SeedState,
+        imagined: Float[Array, "C_M F"] | None,
+        real_ratio: Number,
+        key: PRNGKeyArray,
     ) -> Transition:
-        """G minibatches, each row real with probability λ [], on its own (footnote 2).
+        """G minibatches, each row real with probability λ, on its own (footnote 2).
 
         Args:
-            imagined: [C_M, F], the member's ring; or None, where nobody learns from imagined data.
+            imagined: the member's ring; or None, where nobody learns from imagined data.
         """
         shape = (self.settings.updates_per_step, self.settings.policy_batch_size)
         source_key, real_key, imagined_key = jax.random.split(key, 3)

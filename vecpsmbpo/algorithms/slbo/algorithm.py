@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from vecpsmbpo import dynamics, feedforward, imagination
 from vecpsmbpo.algorithms.base import Algorithm
@@ -24,21 +25,28 @@ class Slbo(Algorithm):
     def nets(self) -> trpo.Networks:
         return trpo.make_networks(self.settings, self.spec)
 
-    def init_agent(self, key: jax.Array) -> trpo.TrpoAgent:
+    def init_agent(self, key: PRNGKeyArray) -> trpo.TrpoAgent:
         return trpo.init(key, self.nets, self.spec)
 
-    def choose(self, counters: Counters, state: SeedState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+    def choose(
+        self, counters: Counters, state: SeedState, obs: Float[Array, " O"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, " A"], Any]:
         """A sample of the policy, clipped."""
         obs = _whitened(self._scaling(state), obs)
         sample = lambda params: self.nets.policy.distribution(params, obs).sample(key)  # noqa: E731
         return jnp.clip(self.layout.select_member(state.episode.member, state.agents.policy, sample), -1.0, 1.0), ()
 
-    def evaluation_policy(self, state: SeedState, key: jax.Array) -> tuple[Params, Scaling]:
+    def evaluation_policy(self, state: SeedState, key: PRNGKeyArray) -> tuple[Params, Scaling]:
         return self.layout.select_member(jnp.int32(0), state.agents.policy), self._scaling(state)
 
     def evaluation_action(
-        self, policy: tuple[Params, Scaling], step: jax.Array, memory: Any, obs: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, Any]:
+        self,
+        policy: tuple[Params, Scaling],
+        step: Int[Array, ""],
+        memory: Any,
+        obs: Float[Array, " O"],
+        key: PRNGKeyArray,
+    ) -> tuple[Float[Array, " A"], Any]:
         params, scaling = policy
         distribution = self.nets.policy.distribution(params, _whitened(scaling, obs))
         action = distribution.loc if self.settings.eval_actions == "mean" else distribution.sample(key)
@@ -56,7 +64,7 @@ class Slbo(Algorithm):
         return jax.tree.map(lambda x: x[0], self.layout.all_models(state.models.scaling))
 
     def refresh(
-        self, counters: Counters, state: SeedState, enabled: jax.Array, key: jax.Array
+        self, counters: Counters, state: SeedState, enabled: Bool[Array, ""], key: PRNGKeyArray
     ) -> tuple[Counters, SeedState]:
         """Alternates between fits of the model and steps of the policy (Algorithm 2, lines 5 to 9)."""
         layout = self.layout
@@ -92,7 +100,7 @@ class Slbo(Algorithm):
         return counters, state.replace(models=models, agents=agents)
 
     def rollouts(
-        self, counters: Counters, real: jax.Array, model: Model, policy: Params, key: jax.Array
+        self, counters: Counters, real: Float[Array, "C F"], model: Model, policy: Params, key: PRNGKeyArray
     ) -> trpo.Rollouts:
         """Rollouts of the policy in the model's mean, from real states; one that terminates begins again from another.
         Their observations are whitened, as policy and value function take them.
