@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from tests import devices
-from vecpsmbpo import config, dynamics, evaluate, metrics, placement
+from vecpsmbpo import config, dynamics, evaluate, jsonl, metrics, placement
 from vecpsmbpo.algorithms.base import Algorithm
 from vecpsmbpo.envs.host.batched import HostEnv
 from vecpsmbpo.programs import initial_inputs, make_algorithm
@@ -91,7 +91,7 @@ def check_log(run_dir: Path, settings) -> None:
     def of(lane, lines):
         return [line for line in lines if tuple((name, line[name]) for name in names) == lane]
 
-    epochs, episodes = (metrics.read(run_dir / name) for name in ("metrics.jsonl", "episodes.jsonl"))
+    epochs, episodes = (jsonl.read(run_dir / name) for name in ("metrics.jsonl", "episodes.jsonl"))
     steps = list(range(settings.epoch_steps, settings.total_steps + 1, settings.epoch_steps))
     assert len(epochs) == len(lanes) * len(steps)
     for lane in lanes:
@@ -130,7 +130,7 @@ def assert_same_run(run_dir: Path, other: Path) -> None:
     for ours, theirs in zip(final_parameters(run_dir), final_parameters(other), strict=True):
         np.testing.assert_array_equal(ours, theirs)
     for file in ("metrics.jsonl", "episodes.jsonl"):
-        assert without_times(metrics.read(run_dir / file)) == without_times(metrics.read(other / file))
+        assert without_times(jsonl.read(run_dir / file)) == without_times(jsonl.read(other / file))
     check_log(run_dir, config.load(run_dir))
 
 

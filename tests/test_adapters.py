@@ -13,7 +13,7 @@ from brax.envs.base import State
 from dm_control import suite
 
 from tests.helpers import assert_resumes_exactly, check_log, command
-from vecpsmbpo import config, envs, metrics
+from vecpsmbpo import config, envs, jsonl
 from vecpsmbpo.envs import termination
 from vecpsmbpo.envs.mjx.adapter import Adapter
 from vecpsmbpo.settings import SettingError
@@ -259,7 +259,7 @@ def test_the_examples_train_from_outside_of_the_package(example, options, tmp_pa
     assert result.returncode == 0, result.stderr
     settings = config.load(tmp_path / "mine" / "run")
     assert dict(settings.env_options) == {"make": example}
-    assert len(metrics.read(tmp_path / "mine" / "run" / "metrics.jsonl")) == 3
+    assert len(jsonl.read(tmp_path / "mine" / "run" / "metrics.jsonl")) == 3
     again = command("train", "run_dir=run", "total_steps=160", cwd=tmp_path / "mine")
     assert again.returncode == 0, again.stderr
     assert "resuming at step 120" in again.stdout

@@ -17,7 +17,7 @@ import vecpsmbpo
 from tests.helpers import check_log, command, files_of, tiny
 from tools.harm.runs import NotTried
 from tools.harm.scarce import mounted
-from vecpsmbpo import checkpoint, config, evaluate, jsonl, metrics, placement, recorded, training
+from vecpsmbpo import config, evaluate, jsonl, orbax_words, placement, recorded, run_log, training
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.training import guards
 from vecpsmbpo.types import Hyper
@@ -106,7 +106,7 @@ def test_what_orbax_says_of_files_that_it_has_given_up_is_not_heard():
     heard: list[types.SimpleNamespace] = []
     given_up, other = (types.SimpleNamespace(exc_value=RuntimeError(x)) for x in ("Event loop is closed", "no"))
     for unraisable in (given_up, other):
-        checkpoint._unless_given_up(heard.append, unraisable)
+        orbax_words.unless_given_up(heard.append, unraisable)
     assert heard == [other]
 
 
@@ -254,10 +254,10 @@ def test_log_files_drop_what_will_be_done_again(tmp_path):
     lines = [{"env_steps": step, "seed": 0, "return": 1.0, "length": 5} for step in (10, 20, 30)]
     path = tmp_path / "episodes.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"env_steps": 40, "se')
-    log = metrics.RunLog(tmp_path, 20, tiny(), warn=pytest.fail)
+    log = run_log.RunLog(tmp_path, 20, tiny(), warn=pytest.fail)
     log.episodes([{"env_steps": 25, "seed": 0, "return": 2.0, "length": 5}])
     log.close()
-    assert [line["env_steps"] for line in metrics.read(path)] == [10, 20, 25]
+    assert [line["env_steps"] for line in jsonl.read(path)] == [10, 20, 25]
 
 
 @pytest.mark.parametrize(

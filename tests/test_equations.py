@@ -230,7 +230,7 @@ def _updated(update, agent, batch, hyper, key):
     return update(agent, batch, sac.Noise.draw(key, batch.action.shape), hyper)
 
 
-def test_temperature_moves_towards_the_target_entropy(key, agent):
+def test_alpha_moves_towards_the_target_entropy(key, agent):
     spec, _, agent, update = agent
     for target, rises in ((50.0, True), (-50.0, False)):
         hyper = Hyper.of(tiny()).replace(target_entropy=jnp.float32(target))

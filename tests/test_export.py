@@ -13,7 +13,7 @@ from PIL import Image
 import vecpsmbpo
 from tests.drawing import draws
 from tests.helpers import command
-from vecpsmbpo import cli, config, envs, metrics
+from vecpsmbpo import cli, config, envs, jsonl
 from vecpsmbpo.look import export, files
 from vecpsmbpo.settings import SettingError
 
@@ -118,7 +118,7 @@ def test_the_real_data_are_exported_as_minari_reads_them(trained, tmp_path, caps
     words = ["export", str(trained), "also=minari", "lane=1", f"out={out}"]
     assert cli.main(words) == 0
     data = minari.MinariDataset(out / "minari" / "vecpsmbpo" / "cartpole_swingup-v0" / "data")
-    lines = [line for line in metrics.read(trained / "episodes.jsonl") if line["seed"] == 1]
+    lines = [line for line in jsonl.read(trained / "episodes.jsonl") if line["seed"] == 1]
     assert data.total_episodes == len(lines) == 3
     for episode, line in zip(data.iterate_episodes(), lines, strict=True):
         assert episode.rewards.sum() == pytest.approx(line["return"], abs=1e-4)

@@ -12,7 +12,7 @@ import pytest
 
 from tests import looks
 from tests.helpers import environment
-from vecpsmbpo import metrics
+from vecpsmbpo import jsonl
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "docs" / "examples").glob("new_*.diff"))
@@ -60,7 +60,7 @@ def train(site: Path, run_dir: Path, *words: str) -> tuple[list[dict], list[dict
     """The lines of a tiny run."""
     task = ("env=cartpole_swingup", "size=tiny", "backend=host", f"run_dir={run_dir}")
     python(site, run_dir.parent, "-m", "vecpsmbpo.cli", "train", *task, *words)
-    return metrics.read(run_dir / "metrics.jsonl"), metrics.read(run_dir / "episodes.jsonl")
+    return jsonl.read(run_dir / "metrics.jsonl"), jsonl.read(run_dir / "episodes.jsonl")
 
 
 def test_a_new_algorithm_trains(extended, tmp_path):

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from tests.helpers import algorithm, environment, initial, tiny
-from vecpsmbpo import placement, sac
+from vecpsmbpo import mesh, placement, sac
 from vecpsmbpo.envs import specs
-from vecpsmbpo.layout import MEMBER_WORK, Layout, _copies, _mesh_shape
+from vecpsmbpo.layout import Layout
 from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.types import Counters, TrainState
 
@@ -178,8 +178,8 @@ def test_saving_rings_leaves_them_to_be_overwritten_in_place():
     ],
 )
 def test_the_mesh_gives_the_busiest_device_least_to_do(lanes, models, members, most, shape):
-    found = _mesh_shape(lanes, models, members, most, lambda shards: 1)
-    work = lambda s, m: lanes // s * (-(-models // m) + MEMBER_WORK * -(-members // m))  # noqa: E731
+    found = mesh.shape(lanes, models, members, most, lambda shards: 1)
+    work = lambda s, m: lanes // s * (-(-models // m) + mesh.MEMBER_WORK * -(-members // m))  # noqa: E731
     assert lanes % found[0] == 0
     assert work(*found) == work(*shape)
     assert found[0] * found[1] <= shape[0] * shape[1] <= most
@@ -201,8 +201,8 @@ def test_the_mesh_gives_the_busiest_device_least_to_do(lanes, models, members, m
     ],
 )
 def test_devices_without_a_member_of_their_own_share_one(lanes, models, members, batch, most, shape, copies):
-    found = _mesh_shape(lanes, models, members, most, partial(_copies, members, batch))
-    assert (found, _copies(members, batch, found[1])) == (shape, copies)
+    found = mesh.shape(lanes, models, members, most, partial(mesh.copies, members, batch))
+    assert (found, mesh.copies(members, batch, found[1])) == (shape, copies)
 
 
 def test_a_member_that_devices_share_equals_one_on_one_device():

@@ -14,7 +14,7 @@ from PIL import Image
 from tensorboardX import record_writer
 
 from tests.helpers import command, tiny
-from vecpsmbpo import cli, config, loggers, metrics
+from vecpsmbpo import cli, config, jsonl, loggers, run_log
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.training import loop
 
@@ -59,7 +59,7 @@ def _line(step, **more):
 
 def test_a_logger_is_told_every_number_on_a_thread_of_its_own(tmp_path, recorder):
     (tmp_path / "walk.gif").write_bytes(b"")
-    log = metrics.RunLog(tmp_path, 0, _settings("wandb"), warn=pytest.fail)
+    log = run_log.RunLog(tmp_path, 0, _settings("wandb"), warn=pytest.fail)
     log.episodes([_line(25)])
     log.metrics([_line(40, eval_return=7.0, model_loss=None, probs=[0.5])])
     log.close()
@@ -96,7 +96,7 @@ def test_who_takes_films_gets_one_of_a_run_that_is_complete(given, step, filmed,
     assert (tmp_path / "episode.gif").exists() == filmed
     assert (tmp_path / "report.html").exists() == settings.report
     if settings.loggers == ("wandb",):
-        metrics.RunLog(tmp_path, 0, settings, warn=pytest.fail).close()
+        run_log.RunLog(tmp_path, 0, settings, warn=pytest.fail).close()
         assert recorder.made[0].sent == (["episode.gif"] if filmed else [])
 
 
@@ -111,19 +111,19 @@ def test_a_film_that_cannot_be_made_is_said(tmp_path):
 
 def test_a_resumed_session_is_the_same_run_and_says_nothing_twice(tmp_path, recorder):
     for begins, steps in ((0, (10, 20, 30)), (20, (30, 40))):  # a kill after step 30 undid what came after 20
-        log = metrics.RunLog(tmp_path, begins, _settings("wandb", "tensorboard"), warn=pytest.fail)
+        log = run_log.RunLog(tmp_path, begins, _settings("wandb", "tensorboard"), warn=pytest.fail)
         log.metrics([_line(step) for step in steps])
         log.close()
     first, second = recorder.made
     assert [step for step, _ in first.told] == [10, 20, 30]
     assert [step for step, _ in second.told] == [40]
     assert first.id == second.id == "made"
-    assert [line["env_steps"] for line in metrics.read(tmp_path / "metrics.jsonl")] == [10, 20, 30, 40]
+    assert [line["env_steps"] for line in jsonl.read(tmp_path / "metrics.jsonl")] == [10, 20, 30, 40]
 
 
 def test_a_logger_that_joins_later_is_told_what_is_done_again(tmp_path, recorder):
     for names, begins, steps in ((["tensorboard"], 0, (10, 20, 30)), (["wandb"], 20, (30, 40))):
-        log = metrics.RunLog(tmp_path, begins, _settings(*names), warn=pytest.fail)
+        log = run_log.RunLog(tmp_path, begins, _settings(*names), warn=pytest.fail)
         log.metrics([_line(step) for step in steps])
         log.close()
     (made,) = recorder.made
@@ -137,12 +137,12 @@ def test_what_goes_wrong_with_a_logger_is_said_once(where, tmp_path, recorder, m
 
     monkeypatch.setattr(recorder, where, fail)
     said = []
-    log = metrics.RunLog(tmp_path, 0, _settings("wandb", "tensorboard"), said.append)
+    log = run_log.RunLog(tmp_path, 0, _settings("wandb", "tensorboard"), said.append)
     for step in range(1, 6):
         log.metrics([_line(step)])
     log.close()
     assert said == ["loggers: the run goes on without wandb (the server is gone)"]
-    assert len(metrics.read(tmp_path / "metrics.jsonl")) == 5
+    assert len(jsonl.read(tmp_path / "metrics.jsonl")) == 5
     assert list((tmp_path / "tensorboard").iterdir())
 
 
@@ -150,12 +150,12 @@ def test_what_goes_wrong_with_a_logger_is_said_once(where, tmp_path, recorder, m
 def test_a_tensorboard_that_cannot_be_written_holds_nothing_up(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(record_writer, "open_file", lambda path: Path("/dev/full").open("wb"))  # noqa: SIM115
     said = []
-    log = metrics.RunLog(tmp_path, 0, _settings("tensorboard"), said.append)
+    log = run_log.RunLog(tmp_path, 0, _settings("tensorboard"), said.append)
     for step in range(1, 300):
         log.metrics([_line(step)])
     log.close()
     assert said == ["loggers: the run goes on without tensorboard ([Errno 28] No space left on device)"]
-    assert len(metrics.read(tmp_path / "metrics.jsonl")) == 299
+    assert len(jsonl.read(tmp_path / "metrics.jsonl")) == 299
     assert capfd.readouterr().err == ""
 
 
@@ -169,14 +169,14 @@ def test_a_logger_that_fails_is_closed_and_told_what_it_missed_where_that_is_don
 
     with monkeypatch.context() as patch:
         patch.setattr(recorder, "scalars", scalars)
-        log = metrics.RunLog(tmp_path, 0, _settings("wandb"), warn=lambda text: None)
+        log = run_log.RunLog(tmp_path, 0, _settings("wandb"), warn=lambda text: None)
         for step in (10, 20, 30):
             log.metrics([_line(step)])
         log.close()
         (first,) = recorder.made
         for thread in first.threads:
             thread.join(10)
-    log = metrics.RunLog(tmp_path, 10, _settings("wandb"), warn=pytest.fail)  # a kill undid what came after step 10
+    log = run_log.RunLog(tmp_path, 10, _settings("wandb"), warn=pytest.fail)  # a kill undid what came after step 10
     for step in (20, 30, 40):
         log.metrics([_line(step)])
     log.close()
@@ -187,7 +187,7 @@ def test_a_logger_that_fails_is_closed_and_told_what_it_missed_where_that_is_don
 def test_tensorboard_that_fails_does_not_stop_a_run_either(tmp_path, monkeypatch):
     monkeypatch.setattr(loggers.TensorBoard, "scalars", lambda *args: 1 / 0)
     said = []
-    log = metrics.RunLog(tmp_path, 0, _settings("tensorboard"), said.append)
+    log = run_log.RunLog(tmp_path, 0, _settings("tensorboard"), said.append)
     log.metrics([_line(1)])
     log.metrics([_line(2)])
     log.close()
@@ -199,7 +199,7 @@ def test_a_connection_that_hangs_holds_nothing_up(tmp_path, recorder, monkeypatc
     monkeypatch.setattr(recorder, "scalars", lambda *args: release.wait(60))
     monkeypatch.setattr(loggers, "CLOSE_S", 0.1)
     said = []
-    log = metrics.RunLog(tmp_path, 0, _settings("wandb"), said.append)
+    log = run_log.RunLog(tmp_path, 0, _settings("wandb"), said.append)
     log.metrics([_line(1)])
     log.close()
     release.set()
@@ -263,7 +263,7 @@ def _two_sessions(name, folder, monkeypatch):
     (run_dir / "report.html").write_text("<p>a page</p>")
     Image.new("RGB", (8, 8)).save(run_dir / "episode.gif")
     for begins, steps in ((0, (10, 20, 30)), (20, (30, 40))):
-        log = metrics.RunLog(run_dir, begins, _settings(name), warn=pytest.fail)
+        log = run_log.RunLog(run_dir, begins, _settings(name), warn=pytest.fail)
         log.metrics([_line(step) for step in steps])
         log.close()
     return run_dir
@@ -351,4 +351,4 @@ def test_a_server_that_is_not_there_does_not_stop_a_run(tmp_path):
     assert result.returncode == 0, result.stderr
     (line,) = [line for line in result.stderr.splitlines() if "mlflow" in line]
     assert line.startswith("vecpsmbpo: warning: loggers: the run goes on without mlflow (")
-    assert len(metrics.read(tmp_path / "run" / "metrics.jsonl")) == 1
+    assert len(jsonl.read(tmp_path / "run" / "metrics.jsonl")) == 1

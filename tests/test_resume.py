@@ -11,7 +11,7 @@ import pytest
 
 import vecpsmbpo
 from tests.helpers import argv, assert_probabilities_follow, assert_same_run, command, environment
-from vecpsmbpo import config, metrics, stopping
+from vecpsmbpo import config, jsonl, stopping
 from vecpsmbpo.settings import SettingError
 
 TOTAL = 320  # so that five attempts which are killed do not come to its end
@@ -135,5 +135,5 @@ def test_evaluation_of_a_run(undisturbed):
 def test_probabilities_can_be_recomputed_from_the_log(undisturbed):
     settings = config.load(undisturbed)
     for seed in (0, 1):
-        lines = [line for line in metrics.read(undisturbed / "episodes.jsonl") if line["seed"] == seed]
+        lines = [line for line in jsonl.read(undisturbed / "episodes.jsonl") if line["seed"] == seed]
         assert_probabilities_follow(lines, settings.n_models, settings)

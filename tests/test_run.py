@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from tests.helpers import METRICS, check_log, command
-from vecpsmbpo import config, metrics, versions
+from vecpsmbpo import config, jsonl, versions
 from vecpsmbpo.envs import registry
 
 
@@ -34,7 +34,7 @@ def test_every_task_runs_end_to_end_and_resumes_on_every_backend(name, backend, 
     result = command("train", "run_dir=run", "total_steps=120", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "resuming at step 80" in result.stdout
-    sessions = metrics.read(tmp_path / "run" / "sessions.jsonl")
+    sessions = jsonl.read(tmp_path / "run" / "sessions.jsonl")
     assert [line.pop("env_steps") for line in sessions] == [0, 80]
     assert set(sessions[0].pop("devices")) == {jax.devices()[0].device_kind}
     assert sessions[0].pop("machine") == versions.machine()
@@ -42,7 +42,7 @@ def test_every_task_runs_end_to_end_and_resumes_on_every_backend(name, backend, 
     settings = config.load(tmp_path / "run")
     assert settings.backend == backend
     check_log(tmp_path / "run", settings)
-    last = metrics.read(tmp_path / "run" / "metrics.jsonl")[-1]
+    last = jsonl.read(tmp_path / "run" / "metrics.jsonl")[-1]
     assert all(np.isfinite(last[field]) for field in METRICS - {"train_return"})
     assert last["compile_seconds"] > 0.5
 

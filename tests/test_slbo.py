@@ -193,6 +193,7 @@ def test_a_run_learns_the_probe(kind, terminates):
     periods = (settings.total_steps - settings.warmup_steps) // settings.model_update_every
     assert float(state.seeds.agents.stats.updates[0, 0]) == periods * settings.rounds * settings.policy_steps
     assert line["model_loss"] < 0.2
+    assert line["model_val_mse"] is None  # nothing validates
     assert np.isfinite([line[name] for name in ("critic_loss", "actor_loss", "entropy", "q_mean")]).all()
     random = np.mean([episode["return"] for episode in metrics.episode_lines(news, 0, settings) if episode["random"]])
     assert random < 0.8

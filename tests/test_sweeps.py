@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from tests.helpers import argv, check_log, command, environment, tiny
-from vecpsmbpo import cli, config, jsonl, metrics
+from vecpsmbpo import cli, config, jsonl
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.stopping import heeding_submitit
 from vecpsmbpo.sweeps import launch, watch
@@ -179,13 +179,13 @@ def test_a_preempted_job_goes_on_by_itself(package, launcher, preempting, tmp_pa
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     sweep = subprocess.Popen(argv("train", "-m", *words), cwd=tmp_path, env=environment(), **pipes)
     run_dir = tmp_path / "runs" / "preempted"
-    while not metrics.read(run_dir / "metrics.jsonl"):
+    while not jsonl.read(run_dir / "metrics.jsonl"):
         assert sweep.poll() is None, sweep.communicate()
         time.sleep(0.1)
     os.kill(holder(run_dir), preempting)
     out, err = sweep.communicate(timeout=600)
     assert sweep.returncode == 2, err
-    first, second = metrics.read(run_dir / metrics.SESSIONS_FILE)
+    first, second = jsonl.read(run_dir / jsonl.SESSIONS_FILE)
     assert first["env_steps"] == 0
     assert 40 <= second["env_steps"] < 400
     check_log(run_dir, config.load(run_dir))

@@ -18,8 +18,8 @@ from vecpsmbpo.training import train as run_training
 from vecpsmbpo.types import Model
 
 # Columns of the logs that are not plain numbers, which is what `runs` reads all of them as.
-COUNTS = ("train_episodes", "unsound_steps", "eval_broken_off")
-WHOLE = ("env_steps", "seed", "episode", "length", "model", "policy", *COUNTS)
+_OF_EPOCHS = "train_episodes", "unsound_steps", "eval_broken_off"
+WHOLE = ("env_steps", "seed", "episode", "length", "model", "policy", *_OF_EPOCHS)
 TRUTHS = ("terminated", "truncated", "random", "frozen")
 
 Array = np.ndarray

@@ -3,8 +3,6 @@
 import json
 import logging
 import os
-import sys
-import traceback
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +16,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import type_handlers
 
-from vecpsmbpo import atomic, placement, processes, recorded, shortages
+from vecpsmbpo import atomic, orbax_words, placement, processes, recorded, shortages
 from vecpsmbpo.algorithms import TABLE
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import SettingError, Settings
@@ -28,29 +26,7 @@ _log = logging.getLogger(__name__)
 FOLDER = "checkpoints"  # in the run directory
 IN_FLIGHT_GB = 0.2  # being written or read at a time
 CHUNK_BYTES = 32 * 2**20  # of one file
-
-
-class _OrbaxIsQuiet(logging.Filter):
-    """Drops what orbax tells of every file that it cannot read or write, beside the error that it raises: through
-    absl's logger and, where its tasks are given up, through asyncio's, which are also other people's."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        frames = traceback.walk_tb(record.exc_info[2]) if record.exc_info else ()
-        files = [record.pathname, *(frame.f_code.co_filename for frame, _ in frames)]
-        return not any("orbax" in file or "tensorstore" in file for file in files)
-
-
-def _unless_given_up(hook: Callable[[Any], object], unraisable: Any) -> None:
-    """Where one file cannot be read or written, orbax closes the loop that waits for the others, and each of them says
-    so, some of them while the process ends."""
-    if "Event loop is closed" not in str(unraisable.exc_value):
-        hook(unraisable)
-
-
-for _name in ("absl", "asyncio"):
-    logging.getLogger(_name).addFilter(_OrbaxIsQuiet())
-logging.getLogger("orbax").setLevel(logging.CRITICAL)
-sys.unraisablehook = partial(_unless_given_up, sys.unraisablehook)
+orbax_words.silence()
 
 
 class Saved(NamedTuple):

@@ -74,7 +74,8 @@ def init(key: PRNGKeyArray, hyper: Hyper, *, net: networks.GaussianMLP, settings
     if settings.has_prior:
         prior = Prior(net.init(jax.random.fold_in(key, 1), jnp.zeros(size)), hyper.prior_scale)
     plain = Scaling(jnp.zeros(size), jnp.ones(size), jnp.ones(spec.obs_size + 1))
-    return Model(params, optim.init(params), plain, loss=zero, val_mse=zero, prior=prior)
+    validated = isinstance(settings, FitSettings)
+    return Model(params, optim.init(params), plain, loss=zero, val_mse=zero if validated else None, prior=prior)
 
 
 def scaling(moments: Moments, added: Whole, settings: Settings) -> Scaling:

@@ -19,15 +19,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from vecpsmbpo import empty_arrays, processes
+from vecpsmbpo import empty_arrays, mesh, processes
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import SeedState, TrainState
 
 SEEDS, MEMBERS = "seeds", "members"
 SHARED, BY_SEED, BY_MEMBER = PartitionSpec(), PartitionSpec(SEEDS), PartitionSpec(SEEDS, MEMBERS)
-
-MEMBER_WORK = 4  # of a member's updates, in fits of a model: about what hopper at the paper's size takes
-LEAST_PART = 32  # rows of a minibatch, below which its gradients take no longer than to average them
 
 
 @dataclass(frozen=True)
@@ -61,8 +58,8 @@ class Layout:
         devices = jax.devices()
         most = min(settings.devices or len(devices), len(devices))
         on_cpu = devices[0].platform == "cpu"
-        copies = partial(_copies, settings.n_members, settings.minibatch if on_cpu else 1)
-        shape = _mesh_shape(len(settings.lanes), settings.n_models, settings.n_members, most, copies)
+        copies = partial(mesh.copies, settings.n_members, settings.minibatch if on_cpu else 1)
+        shape = mesh.shape(len(settings.lanes), settings.n_models, settings.n_members, most, copies)
         grid = np.array(processes.of_all(devices, math.prod(shape))).reshape(shape)
         return cls(
             mesh=Mesh(grid, (SEEDS, MEMBERS)),
@@ -265,31 +262,6 @@ class Layout:
     def members_at_places(self) -> np.ndarray:
         """[P] which member lies there; from N·M on, padding."""
         return np.arange(self.padded_members) // self.copies
-
-
-def _mesh_shape(lanes: int, models: int, members: int, most: int, copies: Callable[[int], int]) -> tuple[int, int]:
-    """Devices over seeds and over members, up to `most` together: such that the busiest has least to do, and no more of
-    them than that takes.
-
-    Args:
-        lanes: S, which the devices over seeds must divide.
-        models, members: N and N·M, which a device has whole numbers of; padded, where it does not divide.
-        copies: how many of so many devices would share a member.
-    """
-
-    def work(seeds: int, shards: int) -> float:
-        of_members = -(-members * copies(shards) // shards) / copies(shards)
-        return lanes // seeds * (-(-models // shards) + MEMBER_WORK * of_members)
-
-    shapes = [(s, m) for s in range(1, most + 1) if lanes % s == 0 for m in range(1, most // s + 1)]
-    return min(shapes, key=lambda shape: (work(*shape), math.prod(shape), shape[1]))
-
-
-def _copies(members: int, batch: int, shards: int) -> int:
-    """How many of the `shards` devices share a member: all that there are to each, if they can cut its minibatches of
-    `batch` rows into equal parts that are worth it."""
-    shared = shards // members
-    return shared if shards == members * shared and batch % shared == 0 and batch // shared >= LEAST_PART else 1
 
 
 def _gathered(x: jax.Array) -> jax.Array:

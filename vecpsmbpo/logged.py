@@ -10,7 +10,7 @@ class Quantity(NamedTuple):
     Attributes:
         label: of an axis.
         caption: below its picture in a report, among those of the inside of a run; without one it is not drawn there.
-        scale: linear; log where it spans powers of ten; or share, from 0 to 1.
+        scale: linear; log where it spans powers of ten; or unit, from 0 to 1.
         always: whether it is in every line: null where nothing learns so.
     """
 
@@ -28,7 +28,7 @@ QUANTITIES = {
     "eval_length": Quantity("length of evaluation episodes"),
     "eval_broken_off": Quantity("evaluation episodes that were broken off"),
     "real_ratio": Quantity(
-        "λ, the share of real data", "λ: the share of real rows in what policies learn from", "share", always=True
+        "λ, the share of real data", "λ: the share of real rows in what policies learn from", "unit", always=True
     ),
     "real_ratio_probs": Quantity("probability of each λ"),
     "temperature": Quantity("temperature τ", always=True),
@@ -41,7 +41,7 @@ QUANTITIES = {
         "model loss (negative log-likelihood)",
         "negative log-likelihood of the models (equation 17; weighted, where nll_beta is)",
     ),
-    "model_val_mse": Quantity("model validation error", "validation error of the models", "log"),
+    "model_val_mse": Quantity("model validation error", "validation error of the models", "log", always=True),
     "env_steps_per_s": Quantity(
         "environment steps per second", "environment steps per second, all seeds together", "log"
     ),

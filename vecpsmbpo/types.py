@@ -129,7 +129,7 @@ class Model(struct.PyTreeNode):
         optimizer: state of Adam; it lives on from refit to refit.
         scaling: see `Scaling`.
         loss: [], mean of what the last epoch of the last fit descended (`dynamics.loss`: equation 17, or weighted).
-        val_mse: [], validation mean squared error of the parameters kept.
+        val_mse: [], validation mean squared error of the parameters kept; None where the fit does not validate.
         prior: or None, where β = 0.
     """
 
@@ -137,7 +137,7 @@ class Model(struct.PyTreeNode):
     optimizer: Any
     scaling: Scaling
     loss: jax.Array
-    val_mse: jax.Array
+    val_mse: jax.Array | None
     prior: Prior | None
 
 

@@ -145,7 +145,7 @@ def _common_steps(here: Sequence[Group], asked: int) -> int:
 
 
 def _scores(group: Group, steps: int, options: dict[str, Any]) -> list[Seed]:
-    lanes = [lane for lane in group.lanes if lane.counts(options["y"])] or group.lanes
+    lanes = [lane for lane in group.lanes if lane.has_any(options["y"])] or group.lanes
     return [score(lane, steps, options) for lane in lanes]
 
 

@@ -245,7 +245,7 @@ def draw_bars(experiment: Experiment) -> "Figure":
     for axis, task, here in panels:
         for index, (m, look) in enumerate(zip(sizes, style.looks(len(sizes), ordered=True), strict=True)):
             cells = [one for one in here if one.values["n_policies"] == m]
-            lanes = ([lane for lane in one.lanes if lane.counts("eval_return")] for one in cells)
+            lanes = ([lane for lane in one.lanes if lane.has_any("eval_return")] for one in cells)
             scores = [np.array([last_evaluations(lane) for lane in each]) for each in lanes]
             errors = [np.std(x, ddof=1) / np.sqrt(len(x)) if len(x) > 1 else 0.0 for x in scores]
             at = [one.values["n_models"] + (index - (len(sizes) - 1) / 2) * width for one in cells]

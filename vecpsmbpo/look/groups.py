@@ -71,7 +71,7 @@ def label(name: str, value: Any) -> str:
 
 def averaged(groups: Iterable[Group], average: str, band: str, columns: Sequence[str] = ("eval_return",)) -> str:
     """What the curves of groups are: `mean of 3 to 5 seeds, 95% bootstrap band`; one seed has no band."""
-    seeds = {sum(lane.counts(name) for lane in one.lanes) for one in groups for name in columns}
+    seeds = {sum(lane.has_any(name) for lane in one.lanes) for one in groups for name in columns}
     if max(seeds) == 1:
         return "one seed"
     of = f"{min(seeds)} to {max(seeds)}" if len(seeds) > 1 else f"{max(seeds)}"

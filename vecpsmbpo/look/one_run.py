@@ -199,7 +199,7 @@ def _lanes_picture(page: "Page", run: Run, y: str) -> str:
         style.threads(axes, look, line.x, line.seeds)
         style.line(axes, look, line.x, line.y, label=line.name)
     quantity = logged.of(y)
-    if quantity.scale == "share":
+    if quantity.scale == "unit":
         axes.set_ylim(-0.03, 1.03)
     elif quantity.scale == "log" and min(line.seeds.min() for line in curves if line.seeds.size) > 0:
         axes.set_yscale("log")

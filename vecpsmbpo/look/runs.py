@@ -68,7 +68,7 @@ class Lane:
         """Columns of episodes.jsonl, [E] each; `probs` [E, N·M]."""
         return self.run.of_lane(self.values)
 
-    def counts(self, name: str) -> bool:
+    def has_any(self, name: str) -> bool:
         """Whether averages of a column have it: not of a lane that was frozen before it had a value there."""
         return not self.frozen or bool(known(self.column(name)).any())
 
@@ -200,7 +200,7 @@ def warnings(runs: Iterable[Run]) -> Iterator[str]:
             yield f"{run.path}: has come to step {run.env_steps:,} of {run.settings.total_steps:,}"
         for lane in run.lanes:
             if lane.frozen:
-                before = "" if lane.counts("eval_return") else "; no average has it, as it has no evaluation"
+                before = "" if lane.has_any("eval_return") else "; no average has it, as it has no evaluation"
                 yield f"{run.path}: {lane.name} was frozen at step {lane.epochs['env_steps'][-1]:.0f}{before}"
 
 

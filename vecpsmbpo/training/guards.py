@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from vecpsmbpo import checkpoint, jsonl, metrics, shortages, words
+from vecpsmbpo import checkpoint, jsonl, shortages, words
 from vecpsmbpo.settings import SettingError
 
 try:
@@ -47,7 +47,7 @@ def check_not_emptied(run_dir: Path) -> None:
     if has_checkpoint(run_dir):
         return
     files = (jsonl.METRICS_FILE, jsonl.EPISODES_FILE)
-    done = max((line[jsonl.STEP] for name in files for line in metrics.read(run_dir / name)), default=0)
+    done = max((line[jsonl.STEP] for name in files for line in jsonl.read(run_dir / name)), default=0)
     if done:
         raise SettingError(
             f"run_dir={run_dir}: its logs reach step {done}, but its checkpoints are gone; put them back, or give "

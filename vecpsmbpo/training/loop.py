@@ -18,6 +18,7 @@ from vecpsmbpo import (
     placement,
     processes,
     resources,
+    run_log,
     runtime,
     versions,
     words,
@@ -142,12 +143,12 @@ class _Session:
         self.to_evaluate = bool(saved and saved.host.get("to_evaluate"))
         self.health = processes.here(self.state.seeds.health)
         self.frozen = np.asarray(health.frozen(self.health))
-        self.log: metrics.RunLog | metrics.NoLog = metrics.NoLog()
+        self.log: run_log.RunLog | run_log.NoLog = run_log.NoLog()
         with processes.together():
             if processes.is_first():
                 config.save(settings, self.run_dir)  # now that it is known to be the run's own
                 marks = saved.host.get("logs", {}) if saved else {}
-                self.log = metrics.RunLog(
+                self.log = run_log.RunLog(
                     self.run_dir, self.env_steps, settings, words.warn, marks, unevaluated=self.to_evaluate
                 )
                 opened.callback(self.log.close)
