@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from vecpsmbpo.programs import initial_inputs, make_algorithm
 from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import EnvSpec, Hyper, Model, SeedState
 
+PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
 METRICS = {
     "env_steps", "seed", "eval_return", "eval_length", "train_return", "model_loss", "model_val_mse", "critic_loss",
     "actor_loss", "alpha", "q_mean", "real_ratio", "env_steps_per_s", "updates_per_s", "imagined_per_s",
@@ -27,6 +29,11 @@ METRICS = {
 EPISODE = {
     "seed", "episode", "env_steps", "model", "policy", "return", "length", "terminated", "truncated", "random", "probs",
 }  # fmt: skip
+
+
+def pinned(package: str) -> str:
+    """What pyproject.toml asks for of a package that it pins: `dm-control==1.0.49`."""
+    return next(text.split(";")[0] for text in PROJECT["dependencies"] if text.startswith(f"{package}=="))
 
 
 def tiny(**changes: Any) -> Settings:
@@ -38,6 +45,14 @@ def new_model(key: jax.Array, settings: Settings, spec: EnvSpec, hyper: Hyper | 
     """A dynamics model before its first fit."""
     net = dynamics.network(settings, spec)
     return dynamics.init(key, hyper or Hyper.of(settings), net=net, settings=settings, spec=spec)
+
+
+def constant(params: Any, outputs: jax.Array) -> Any:
+    """Parameters of a network that answers `outputs` [..., K] whatever it is asked."""
+    params = jax.tree.map(jax.numpy.zeros_like, params)
+    last = sorted(name for name in params["params"] if name.startswith("Dense"))[-1]
+    params["params"][last]["bias"] = outputs
+    return params
 
 
 def algorithm(settings: Settings, spec: EnvSpec) -> Any:

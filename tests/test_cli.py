@@ -14,8 +14,7 @@ import mujoco
 import pytest
 
 import vecpsmbpo
-from tests.helpers import command, environment
-from tests.test_setup import DM_CONTROL
+from tests.helpers import command, environment, pinned
 from vecpsmbpo import cli, config
 from vecpsmbpo.algorithms import TABLE
 from vecpsmbpo.algorithms.catalogue import FIELDS, allowed, check, of_algorithm
@@ -182,7 +181,7 @@ def test_envs_names_every_task_and_how_to_install_what_is_missing(monkeypatch, c
     assert [line.split()[0] for line in lines] == list(TASKS)
     said = {line.split()[0]: line.partition("no: pip install ")[2].rstrip() for line in lines}
     assert said["playground"] == "'vecpsmbpo[playground]'"
-    assert said["dm_control"] == said["ball_in_cup"] == f"--no-deps {DM_CONTROL}"
+    assert said["dm_control"] == said["ball_in_cup"] == f"--no-deps {pinned('dm-control')}"
     assert said["hopper"] == "gymnasium"
 
 

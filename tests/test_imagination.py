@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from tests.helpers import algorithm, initial, tiny
+from tests.helpers import algorithm, constant, initial, tiny
 from vecpsmbpo import health, placement, replay
 from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.types import Counters, EnvSpec, Transition
@@ -14,14 +14,6 @@ from vecpsmbpo.types import Counters, EnvSpec, Transition
 LIMIT = 3.5
 SPEC = EnvSpec("counter", obs_size=2, action_size=1, episode_length=10, terminated=lambda o, a, n: n[..., 0] > LIMIT)
 N, M, ROWS = 3, 2, 40
-
-
-def constant(params, outputs):
-    """Parameters of a network that answers `outputs` [..., K] whatever it is asked."""
-    params = jax.tree.map(jnp.zeros_like, params)
-    last = sorted(name for name in params["params"] if name.startswith("Dense"))[-1]
-    params["params"][last]["bias"] = outputs
-    return params
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from tests import helpers
-from tests.helpers import new_model, tiny
-from tests.test_drivers import make_driver
-from tests.test_imagination import constant
+from tests.helpers import constant, new_model, tiny
+from tests.learners import make_driver
 from vecpsmbpo import dynamics, metrics
 from vecpsmbpo.algorithms.pets import planning
 from vecpsmbpo.programs import evaluation_keys, initial_inputs

@@ -4,15 +4,15 @@ import re
 import shutil
 import subprocess
 import sys
-import tomllib
 from importlib import metadata
 from pathlib import Path
 
 import pytest
 
+from tests.helpers import PROJECT, pinned
+
 ROOT = Path(__file__).parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-DM_CONTROL = next(text.split(";")[0] for text in PROJECT["dependencies"] if text.startswith("dm-control=="))
+DM_CONTROL = pinned("dm-control")
 
 # An interpreter of `version` that writes down what pip is asked for. `venv` makes another of itself.
 PYTHON = """#!/bin/sh

@@ -10,9 +10,8 @@ import scipy.stats
 from jax.flatten_util import ravel_pytree
 
 from tests.helpers import algorithm as make_algorithm
-from tests.helpers import new_model, tiny
-from tests.test_drivers import make_driver
-from tests.test_imagination import constant
+from tests.helpers import constant, new_model, tiny
+from tests.learners import make_driver
 from vecpsmbpo import dynamics, metrics, replay
 from vecpsmbpo.algorithms.slbo import multistep, networks, trpo
 from vecpsmbpo.envs import specs

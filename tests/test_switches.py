@@ -10,9 +10,8 @@ import scipy.integrate
 import scipy.stats
 
 from tests import probes
-from tests.helpers import algorithm, assert_probabilities_follow, new_model, tiny
-from tests.test_drivers import make_driver, settings_for
-from tests.test_imagination import constant
+from tests.helpers import algorithm, assert_probabilities_follow, constant, new_model, tiny
+from tests.learners import make_driver, settings_for
 from vecpsmbpo import dynamics, metrics, posterior, sac
 from vecpsmbpo.envs import specs
 from vecpsmbpo.programs import initial_inputs
