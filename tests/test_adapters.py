@@ -248,6 +248,7 @@ def test_a_task_of_every_suite_trains_and_resumes(task, tmp_path):
     ("example", "options"),
     [
         ("pendulum_mjx:Pendulum", []),
+        ("pendulum_mujoco:Pendulum", ["backend=host"]),
         ("point_mass_gymnasium:PointMass", ["backend=host"]),
     ],
 )

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers import EPISODE, METRICS
+from vecpsmbpo import logged
+
 ROOT = Path(__file__).parent.parent
 PLACES = {"vecpsmbpo": ROOT / "vecpsmbpo", "vecpsmbpo.envs": ROOT / "envs"}
 
@@ -77,3 +80,10 @@ def test_modules_import_what_stands_to_their_left(graph):
     ]
     assert not wrong
     assert {place for place in ranked.values() if place is not None} == set(range(len(order)))
+
+
+def test_every_column_of_the_logs_is_explained():
+    text = (ROOT / "docs/logs.md").read_text()
+    epochs, episodes = (set(re.findall(r"`(\w+)`", part)) for part in text.split("## episodes.jsonl"))
+    assert epochs >= METRICS | set(logged.QUANTITIES) - {"env_steps"}
+    assert episodes >= EPISODE

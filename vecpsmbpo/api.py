@@ -127,7 +127,8 @@ class Run:
         Raises:
             SettingError: there is no checkpoint, or the algorithm has no policy (PETS).
         """
-        return members.acting(self._trained, "best")[0][1]
+        act = members.acting(self._trained, "best")[0][1]
+        return lambda obs: act(jnp.asarray(obs, jnp.float32))
 
     @cached_property
     def models(self) -> list[DynamicsModel]:
@@ -204,14 +205,7 @@ class Policy:
 
 
 def load(path: str | Path, lane: int = 0) -> Run | Policy:
-    """The run, or the exported policy, in a directory.
-
-    Args:
-        lane: of a run: which seed, or seed with a swept value.
-
-    Raises:
-        SettingError: there is neither, or no such lane.
-    """
+    """As `vecpsmbpo.load`."""
     if not exported.is_one(path):
         return Run(path, lane)
     if lane:
@@ -220,18 +214,7 @@ def load(path: str | Path, lane: int = 0) -> Run | Policy:
 
 
 def train(**settings: Any) -> Run:
-    """Trains, as `vecpsmbpo train` does: the same names, checks and files.
-
-    `env.*` and `sweep.*` are `env_options={...}` and `sweep={...}`. A `run_dir` that holds a run goes on with it.
-    Ctrl-C finishes the running chunk, saves, and returns; the run is then not `complete`. A lane in which something
-    stopped being finite is held there (`health`): `frozen` says so in its last row of `metrics`.
-
-    Raises:
-        SettingError: a mistake in the settings, in one line.
-        training.TaskFailed: the task's own code did, and how to go on.
-        training.DiskError: the run directory cannot be written.
-        training.OutOfMemory: the system gives no more.
-    """
+    """As `vecpsmbpo.train`."""
     if settings.get("distributed"):
         raise SettingError("distributed: is for the command line, which a run of several processes has to itself")
     resolved = config.resolve(config.overrides_of(settings))

@@ -1,7 +1,6 @@
 """Sets JAX up for a run. Must come before the first array: a backend cannot be changed once it is there."""
 
 import functools
-import logging
 import os
 import re
 import subprocess
@@ -39,8 +38,8 @@ def configure(settings: Settings) -> None:
     if "xla_force_host_platform_device_count" not in flags:
         try:
             jax.config.update("jax_num_cpu_devices", cores)
-        except RuntimeError:  # a backend is there already: an earlier job's, or of a program that imports this package
-            logging.getLogger(__name__).debug("JAX is already initialised; its devices are used as they are")
+        except RuntimeError:  # a backend is there already: an earlier run's, or of a program that imports this package
+            _say_what_is_missing(min(settings.devices or cores, cores))
     processes.join(settings.distributed)
     jax.config.update("jax_enable_compilation_cache", settings.compile_cache)
     if settings.compile_cache:
@@ -56,6 +55,16 @@ def configure(settings: Settings) -> None:
         asked = os.environ.get("JAX_PLATFORMS")
         what = f"JAX_PLATFORMS={asked}: no such device here" if asked else f"JAX finds no device ({words.of(error)})"
         raise SettingError(what) from None
+
+
+@functools.cache
+def _say_what_is_missing(wanted: int) -> None:
+    devices = jax.devices()
+    if devices[0].platform == "cpu" and len(devices) < wanted:
+        words.warn(
+            f"JAX was started before this, with {len(devices)} device(s), where {wanted} cores could work; call train "
+            "before anything else makes a JAX array"
+        )
 
 
 def check_float32() -> None:

@@ -1,10 +1,12 @@
-"""A task of your own on MJX: swing a pendulum up with a motor too weak to lift it.
+"""A robot of your own from its MJCF file, on MJX: swing a pendulum up with a motor too weak to lift it.
 
     cd docs/examples
     vecpsmbpo train env=custom env.make=pendulum_mjx:Pendulum episode_length=200 size=cpu
 
 Everything runs inside the one compiled program: the simulator, the models, the policies.
 """
+
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,18 +17,6 @@ from vecpsmbpo.envs.mjx.base import MjxEnv
 from vecpsmbpo.envs.mjx.simulator import Physics
 from vecpsmbpo.types import EnvSpec
 
-XML = """
-<mujoco>
-  <option timestep="0.01"/>
-  <worldbody>
-    <body pos="0 0 1">
-      <joint name="hinge" type="hinge" axis="0 1 0" damping="0.02"/>
-      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.03" mass="0.2"/>
-    </body>
-  </worldbody>
-  <actuator><motor joint="hinge" gear="0.25" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
 SUBSTEPS = 5  # simulator steps per control step: 0.05 s
 
 
@@ -38,7 +28,8 @@ class Pendulum(MjxEnv):
     spec = EnvSpec("pendulum", obs_size=3, action_size=1, episode_length=200, terminated=termination.never)
 
     def __init__(self):
-        super().__init__(mujoco.MjModel.from_xml_string(XML), SUBSTEPS)
+        robot = Path(__file__).with_name("pendulum.xml")
+        super().__init__(mujoco.MjModel.from_xml_path(str(robot)), SUBSTEPS)
 
     def initial_state(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """qpos [1] and qvel [1]: hanging, more or less."""
