@@ -39,6 +39,11 @@ class Simulator(abc.ABC):
         """The inverse of `save`."""
 
 
+def diverged(obs_size: int) -> tuple[np.ndarray, float, bool, bool]:
+    """What a `Simulator` answers to a step in which it has: nothing that could be believed."""
+    return np.full(obs_size, np.nan), np.nan, False, False
+
+
 class HostStep(NamedTuple):
     """What a step of B environments gives.
 

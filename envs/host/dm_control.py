@@ -8,7 +8,7 @@ from dm_control.rl.control import PhysicsError
 
 from vecpsmbpo.envs import specs, termination
 from vecpsmbpo.envs.host import attributes
-from vecpsmbpo.envs.host.batched import HostEnv, Simulator
+from vecpsmbpo.envs.host.batched import HostEnv, Simulator, diverged
 from vecpsmbpo.envs.host.mujoco_state import MujocoState
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import EnvSpec
@@ -49,7 +49,7 @@ class DmControlSimulator(Simulator):
         try:
             timestep = self.env.step(self._low + (action + 1) * (self._high - self._low) / 2)
         except PhysicsError:  # it has diverged
-            return np.full(self._obs_size, np.nan), np.nan, False, False
+            return diverged(self._obs_size)
         terminated = bool(timestep.last() and timestep.discount == 0.0)
         return _flat(timestep.observation), float(timestep.reward), terminated, timestep.last() and not terminated
 

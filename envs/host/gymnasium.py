@@ -9,7 +9,7 @@ import numpy as np
 
 from vecpsmbpo.envs import specs, termination
 from vecpsmbpo.envs.host import attributes
-from vecpsmbpo.envs.host.batched import HostEnv, Simulator
+from vecpsmbpo.envs.host.batched import HostEnv, Simulator, diverged
 from vecpsmbpo.envs.host.mujoco_state import MujocoState
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import EnvSpec, TerminationRule
@@ -49,7 +49,7 @@ class GymnasiumSimulator(Simulator):
         scaled = self._low + (action + 1) * (self._high - self._low) / 2
         obs, reward, terminated, truncated, _ = self.env.step(scaled.astype(self.env.action_space.dtype))
         if self._state and self._state.diverged:
-            return np.full(np.shape(obs), np.nan), np.nan, False, False
+            return diverged(len(obs))
         return obs, float(reward), bool(terminated), bool(truncated)
 
     def save(self) -> dict[str, Any]:

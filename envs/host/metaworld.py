@@ -21,7 +21,7 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS, ALL_V3_ENVIRONMENTS_GOAL_OBS
 
 from vecpsmbpo.envs import specs, termination
 from vecpsmbpo.envs.host import attributes
-from vecpsmbpo.envs.host.batched import HostEnv, Simulator
+from vecpsmbpo.envs.host.batched import HostEnv, Simulator, diverged
 from vecpsmbpo.envs.host.mujoco_state import MujocoState
 from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import EnvSpec
@@ -65,7 +65,7 @@ class MetaworldSimulator(Simulator):
         self._state.begin_step(action)
         obs, reward, _, _, _ = self.env.step(action)  # Metaworld never terminates
         if self._state.diverged:
-            return np.full_like(obs, np.nan), np.nan, False, False
+            return diverged(len(obs))
         return obs, float(reward), False, False
 
     def save(self) -> dict[str, Any]:
