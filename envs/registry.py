@@ -127,13 +127,18 @@ def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0, 
     """
     backend = resolve_backend(name, backend)
     check_installed(name)
-    module, attribute = TASKS[name].code[backend].split(":")
-    told = {**TASKS[name].original, **options, "name": name} if attribute == "original" else options
+    task = TASKS[name]
+    module, attribute = task.code[backend].split(":")
     which = " ".join([f"env={name}", *(f"env.{option}={value}" for option, value in options.items())])
     try:
         found = getattr(importlib.import_module(f"vecpsmbpo.envs.{backend}.{module}"), attribute)
         with contextlib.chdir("."):  # to come back: a task that goes elsewhere must not take the run's files along
-            made = found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **told)
+            if backend == "mjx":
+                made = found(**options)
+            elif task.original:
+                made = found(num_envs=num_envs, seed=seed, name=name, **task.original, **options)
+            else:
+                made = found(num_envs=num_envs, seed=seed, **options)
         if min(made.spec.obs_size, made.spec.action_size) < 1:
             sizes = f"{made.spec.obs_size} observation(s) and {made.spec.action_size} action(s)"
             raise SettingError(f"{which}: has {sizes}; it must have at least one of each")

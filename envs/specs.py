@@ -9,5 +9,9 @@ def get(name: str) -> EnvSpec:
     """The spec of one of the registry's own tasks."""
     task = TASKS[name]
     assert task.sizes is not None, f"{name} is a suite, not a task"
-    rule = termination.of_gymnasium(task.original["id"]) if task.suite == "gymnasium" else termination.never
+    rule = termination.never
+    if env_id := task.original.get("id"):
+        found = termination.of_gymnasium(env_id)
+        assert found, f"{env_id}: has no rule in `termination.OF_GYMNASIUM`"
+        rule = found
     return EnvSpec(name, *task.sizes, rule)

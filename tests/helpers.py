@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,8 @@ METRICS = {
     "actor_loss", "alpha", "q_mean", "real_ratio", "env_steps_per_s", "updates_per_s", "imagined_per_s",
     "seconds",
 }  # fmt: skip
+# Every column is in docs/logs.md.
+EXPLAINED = set(re.findall(r"`(\w+)`", (Path(__file__).parents[1] / "docs" / "logs.md").read_text()))
 EPISODE = {
     "seed", "episode", "env_steps", "model", "policy", "return", "length", "terminated", "truncated", "random", "probs",
 }  # fmt: skip
@@ -117,6 +120,7 @@ def check_log(run_dir: Path, settings) -> None:
         assert sum(line["length"] for line in own) > settings.total_steps - settings.episode_length
         assert np.allclose([np.sum(line["probs"]) for line in own], 1.0, atol=1e-5)
     assert all(set(line) >= METRICS | set(names) for line in epochs)
+    assert {name for line in [*epochs, *episodes] for name in line} <= EXPLAINED | set(names)
     assert list((run_dir / "tensorboard").iterdir())
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import vecpsmbpo
-from vecpsmbpo import cli, config
+from tests.helpers import tiny
+from vecpsmbpo import cli, config, runtime
 from vecpsmbpo.training import loop
 
 TINY = {"env": "cartpole_swingup", "backend": "host", "size": "tiny"}
@@ -192,3 +193,20 @@ def test_values_are_written_as_a_command_line_has_them():
         "report=true",
         "seed=3",
     ]
+
+
+def test_where_jax_came_first_with_fewer_devices_it_is_said(monkeypatch):
+    assert runtime.idle_cores(tiny()) == ""  # the tests have said how many there are
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(runtime, "_cores", lambda: 3)
+    assert runtime.idle_cores(tiny()).startswith(
+        "JAX was started before vecpsmbpo, with 2 device(s), where 3 cores could"
+    )
+    assert runtime.idle_cores(tiny(devices=2)) == ""
+
+
+@pytest.mark.parametrize(("algo", "given"), [("pets", "policy"), ("pets", "actions"), ("slbo", "policy")])
+def test_what_an_algorithm_has_no_choice_of_is_refused_in_evaluation(algo, given):
+    settings = tiny(algo=algo, **({"plan_particles": 2} if algo == "pets" else {}))
+    with pytest.raises(vecpsmbpo.SettingError, match=f"{given}=best: there is no choice with algo={algo}"):
+        config.for_evaluation(settings, {given: "best"})

@@ -243,3 +243,8 @@ def test_mistakes_are_named():
         envs.make("hopper", "gpu")
     with pytest.raises(ValueError, match=r"must have shape \(2, 3\)"):
         envs.make("hopper", "host", num_envs=2).step(np.zeros((1, 3)))
+
+
+def test_a_task_s_original_is_no_option_of_it():
+    with pytest.raises(SettingError, match=r"env=hopper env.id=Ant-v4: cannot be made \(TypeError"):
+        envs.make("hopper", "host", id="Ant-v4")

@@ -12,7 +12,7 @@ import scipy.stats
 from tests import probes
 from tests.helpers import algorithm, assert_probabilities_follow, constant, new_model, tiny
 from tests.learners import make_driver, settings_for
-from vecpsmbpo import dynamics, metrics, posterior, sac
+from vecpsmbpo import dynamics, metrics, posterior, sac, schedule
 from vecpsmbpo.envs import specs
 from vecpsmbpo.programs import initial_inputs
 from vecpsmbpo.types import Counters, Hyper, Transition
@@ -211,28 +211,45 @@ def test_what_is_chosen_can_be_recomputed_from_the_log(adapted):
 
 @pytest.fixture(scope="module")
 def valued():
-    """Members drawn by what their critics promise: settings, driver, state, episodes, and values of a state's seed."""
+    """Members drawn by what their critics promise: settings, algorithm, state, episodes, and values of a state's
+    seed."""
     settings, driver, state, lines, _ = run(weights="values", temperature=0.1)
     parts = driver.layout.specs().seeds
     values = driver.layout.jit_shard_map(jax.vmap(driver.algorithm.values), (parts,), parts.key)
-    return settings, driver.algorithm.spec, state, lines, lambda seeds: values(seeds)[0]
+    return settings, driver.algorithm, state, lines, lambda seeds: values(seeds)[0]
 
 
 def test_members_may_be_drawn_by_what_their_critics_promise(valued):
     """Section 3.3: probabilities are those of the values in the log, and values those of the critics at real starts."""
-    settings, spec, state, lines, values = valued
+    settings, learner, state, lines, values = valued
     for line in lines:
         logits = np.array(line["values"]) / settings.temperature
         expected = np.exp(logits - logits.max())
         np.testing.assert_allclose(line["probs"], expected / expected.sum(), atol=1e-5)
     assert not np.any(lines[0]["values"])  # nothing is known before the first start
     assert len(np.unique(lines[-1]["values"])) == settings.n_members
-    nets, start = sac.make_networks(settings, spec), jnp.zeros(1)  # where every episode begins
+    nets, start = learner.nets, jnp.zeros(1)  # where every episode begins
     for member, found in enumerate(values(state.seeds)):
         agent = jax.tree.map(lambda x, member=member: x[0, member], state.seeds.agents)
         action = jnp.tanh(nets.actor.distribution(agent.actor, start).loc)
         by_hand = np.min(nets.critic.values(agent.critic, start, action))
         assert found == pytest.approx(max(by_hand, 0.0), rel=1e-4)
+
+
+def test_no_member_promises_more_than_the_rewards_seen_allow_this_step_s_included(valued):
+    """A reward of 7 ends an episode; r / (1 - γ) = 14 is then the most that anybody may promise in the next one."""
+    settings, learner, state, _, _ = valued
+    whole = learner.layout.specs()
+    seeds, by_seed = whole.seeds, whole.seeds.key
+    inputs = (whole.counters, seeds, by_seed, by_seed, by_seed)
+    observe = learner.layout.jit_shard_map(schedule.over_seeds(learner.observe), inputs, (seeds, by_seed))
+    boundless = jax.tree.map(lambda x: jnp.full_like(x, 1e3), state.seeds.agents.critic)
+    before = state.seeds.replace(agents=state.seeds.agents.replace(critic=boundless))
+    vector, number = jnp.zeros((1, 1)), jnp.zeros(1)
+    step = Transition(vector, vector, number + 7, vector, number)
+    after, end = observe(state.counters, before, step, jnp.array([True]), state.seeds.key)
+    assert end.done.all()
+    np.testing.assert_allclose(after.episode.values, 7 / (1 - settings.discount))
 
 
 def test_the_start_of_an_episode_to_come_is_not_known(valued):
@@ -296,7 +313,6 @@ def test_the_average_s_actions_come_from_all_members(key):
 
 
 def _actor(learner, key):
-    from vecpsmbpo import sac
 
     return sac.init(key, sac.make_networks(learner.settings, learner.spec), learner.spec).actor["params"]
 

@@ -34,7 +34,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__doc__", "__version__"]
+    return sorted({*globals(), *__all__} - {"Any", "TYPE_CHECKING", "importlib", "sys"})
 
 
 def train(**settings: Any) -> "Run":

@@ -26,6 +26,7 @@ _log = logging.getLogger(__name__)
 FOLDER = "checkpoints"  # in the run directory
 IN_FLIGHT_GB = 0.2  # being written or read at a time
 CHUNK_BYTES = 32 * 2**20  # of one file
+
 orbax_words.silence()
 
 

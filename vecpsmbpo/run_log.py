@@ -34,7 +34,7 @@ class RunLog:
             marks: what `marks` was at `env_steps`.
             unevaluated: whether the epoch that ended there had not been evaluated: its lines will be written again.
         """
-        self._run_dir, self._lane = run_dir, tuple(settings.lanes[0])
+        self._lane = tuple(settings.lanes[0])
         needed = (jsonl.STEP, *self._lane)
         self._files = {
             name: jsonl.Growing(run_dir / name, env_steps, needed, marks.get(name), warn, unfinished=unevaluated)

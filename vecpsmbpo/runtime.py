@@ -1,6 +1,7 @@
 """Sets JAX up for a run. Must come before the first array: a backend cannot be changed once it is there."""
 
 import functools
+import logging
 import os
 import re
 import subprocess
@@ -14,6 +15,7 @@ from vecpsmbpo import processes, words
 from vecpsmbpo.settings import SettingError, Settings
 
 SINGLE_THREADED = "--xla_cpu_multi_thread_eigen=false"
+COUNT_FLAG = "xla_force_host_platform_device_count"  # who gives it has said how many CPU devices there are
 
 
 def configure(settings: Settings) -> None:
@@ -28,18 +30,17 @@ def configure(settings: Settings) -> None:
         SettingError: XLA does not know a flag in XLA_FLAGS, JAX is told to compute in float64, it finds no device, or
             not the one that JAX_PLATFORMS asks for, or the other processes are not there.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     check_float32()
     flags = os.environ.get("XLA_FLAGS", "")
     if others := flags.replace(SINGLE_THREADED, "").strip():
         _check_flags(others)
     if "xla_cpu_multi_thread_eigen" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {SINGLE_THREADED}".strip()
-    if "xla_force_host_platform_device_count" not in flags:
+    if COUNT_FLAG not in flags:
         try:
-            jax.config.update("jax_num_cpu_devices", cores)
+            jax.config.update("jax_num_cpu_devices", _cores())
         except RuntimeError:  # a backend is there already: an earlier run's, or of a program that imports this package
-            _say_what_is_missing(min(settings.devices or cores, cores))
+            logging.getLogger(__name__).debug("JAX is already initialised; its devices are used as they are")
     processes.join(settings.distributed)
     jax.config.update("jax_enable_compilation_cache", settings.compile_cache)
     if settings.compile_cache:
@@ -57,14 +58,20 @@ def configure(settings: Settings) -> None:
         raise SettingError(what) from None
 
 
-@functools.cache
-def _say_what_is_missing(wanted: int) -> None:
+def idle_cores(settings: Settings) -> str:
+    """In words, where JAX was started before this package with fewer CPU devices than a run could use; else nothing."""
     devices = jax.devices()
-    if devices[0].platform == "cpu" and len(devices) < wanted:
-        words.warn(
-            f"JAX was started before this, with {len(devices)} device(s), where {wanted} cores could work; call train "
-            "before anything else makes a JAX array"
-        )
+    wanted = min(settings.devices or _cores(), _cores())
+    if devices[0].platform != "cpu" or len(devices) >= wanted or COUNT_FLAG in os.environ.get("XLA_FLAGS", ""):
+        return ""
+    return (
+        f"JAX was started before vecpsmbpo, with {len(devices)} device(s), where {wanted} cores could work; train "
+        "before anything else makes a JAX array"
+    )
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_float32() -> None:

@@ -216,12 +216,12 @@ class Algorithm(ABC):
         row, sound = self._row(state, transition)
         stored = self._unpack(row)
         end = _news(state.episode, transition, truncated, sound)
-        state = self.credit(state, end.episode_return, end.done & ~end.random)  # line 15
         state = state.replace(  # line 7
             real=replay.add(state.real, row[None], counters.env_steps),
             newest=row,
             moments=moments.add(state.moments, stored, counters.env_steps),
         )
+        state = self.credit(state, end.episode_return, end.done & ~end.random)  # line 15
         state = self.note_start(state, jnp.where(possible(transition.obs), transition.obs, stored.obs))
         random = counters.env_steps + 1 < self.settings.warmup_steps
         state = self._go_on(state, end, random, key)  # lines 1 and 3

@@ -13,6 +13,7 @@ from vecpsmbpo import (
     config,
     crash,
     health,
+    jsonl,
     loggers,
     metrics,
     placement,
@@ -66,6 +67,8 @@ def train(settings: Settings, stop: Stop | None = None) -> int:
     """
     check_place(settings.run_dir)
     runtime.configure(settings)
+    if said := runtime.idle_cores(settings):
+        words.warn(said)
     try:
         return _train(settings, stop)
     except SimulatorError as error:
@@ -301,7 +304,7 @@ class _Session:
         if settings.report:
             report.keep(self.run_dir, words.warn)
 
-    def _lines(self, returns: Returns, seconds: float) -> list[metrics.Line]:
+    def _lines(self, returns: Returns, seconds: float) -> list[jsonl.Line]:
         rates = Rates.over(self.driver.algorithm, self.env_steps, self.epoch_steps_done, seconds)
         return [
             {
@@ -318,7 +321,7 @@ class _Session:
             for index, line in enumerate(self._epoch_lines())
         ]
 
-    def _epoch_lines(self) -> list[metrics.Line]:
+    def _epoch_lines(self) -> list[jsonl.Line]:
         state = processes.here(self.state.without_rings())
         return metrics.epoch_lines(placement.unpad(self.driver.layout, state), self.driver.algorithm)
 
@@ -333,7 +336,7 @@ class _Session:
         for lane in new:
             self.display.say(self._frozen_words(lane))
 
-    def _last_line(self, line: metrics.Line, lane: int) -> metrics.Line:
+    def _last_line(self, line: jsonl.Line, lane: int) -> jsonl.Line:
         """A lane's last, from `line` of its last good state. Its step is one that every checkpoint which knows of the
         freezing has reached, and no other: it is never written twice."""
         evaluated = ("eval_return", "eval_length", "eval_broken_off")

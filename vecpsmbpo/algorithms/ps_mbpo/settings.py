@@ -40,6 +40,9 @@ class RealDataSettings(PsMbpoSettings):
         moves = self.real_ratio_schedule != "constant" or "real_ratio" in dict(self.sweep)
         yield moves or self.real_ratio != 1, f"real_ratio: must be 1 with algo={self.algo}, and stay there"
         for name, _ in self.sweep:
-            unused = name.startswith("model_") or name == "prior_scale"
-            yield unused, f"sweep.{name}: algo={self.algo} fits no model, so that its values would all do the same"
+            unused = name.startswith("model_") or name in ("prior_scale", "temperature")
+            yield (
+                unused,
+                f"sweep.{name}: algo={self.algo} has one policy and no model; its values all do the same",
+            )
         yield from super().contradictions()
