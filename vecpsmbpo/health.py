@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from vecpsmbpo.layout import Layout
 from vecpsmbpo.settings import Settings
-from vecpsmbpo.types import Flag, Health, SeedState, TrainState, Whole, possible
+from vecpsmbpo.types import Health, SeedState, TrainState, Whole, possible
 
 # A code is a rank times `_WIDTH` plus the index of a member or model. Ranks are the entries of `PASSING` and then
 # the leaves of the state. Of several the smallest leaf is named; what passed by is as a rule its consequence.
@@ -34,7 +34,7 @@ def init() -> Health:
     return Health(code=nowhere, env_steps=jnp.int32(0), passing=nowhere)
 
 
-def note(health: Health, what: str, bad: Flag, member: Whole = 0) -> Health:
+def note(health: Health, what: str, bad: Bool[Array, "*S"], member: Whole = 0) -> Health:
     """Remembers, where `bad`, that `what` of `PASSING` was not finite."""
     code = jnp.where(bad, PASSING.index(what) * _WIDTH + member, NOWHERE)
     return health.replace(passing=jnp.minimum(health.passing, code))

@@ -123,8 +123,8 @@ class PsMbpo(Algorithm):
         return self.layout.select_member(member, state.agents.actor)
 
     def evaluation_action(
-        self, policy: Params, step: Int[Array, ""], memory: Any, obs: Float[Array, " O"], key: PRNGKeyArray
-    ) -> tuple[Float[Array, " A"], Any]:
+        self, policy: Params, step: Int[Array, ""], memory: Any, obs: Float[Array, "*batch O"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, "*batch A"], Any]:
         """The mean action or a sample of it: of the member chosen; with `posterior=average` of a member drawn at every
         step, as `choose` does; with `eval_policy=average` the average of all members' mean actions."""
         sampled = self.settings.eval_actions == "sampled"

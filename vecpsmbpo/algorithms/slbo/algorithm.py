@@ -44,9 +44,9 @@ class Slbo(Algorithm):
         policy: tuple[Params, Scaling],
         step: Int[Array, ""],
         memory: Any,
-        obs: Float[Array, " O"],
+        obs: Float[Array, "*batch O"],
         key: PRNGKeyArray,
-    ) -> tuple[Float[Array, " A"], Any]:
+    ) -> tuple[Float[Array, "*batch A"], Any]:
         params, scaling = policy
         distribution = self.nets.policy.distribution(params, _whitened(scaling, obs))
         action = distribution.loc if self.settings.eval_actions == "mean" else distribution.sample(key)
