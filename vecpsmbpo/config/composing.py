@@ -1,4 +1,7 @@
-"""A new run's settings: what Hydra composes of `configs/` and a command line."""
+"""A new run's settings: what Hydra composes of `configs/` and a command line.
+
+Hydra is imported by whoever composes: `--help`, and commands that only read runs, answer sooner without it.
+"""
 
 import contextlib
 import dataclasses
@@ -6,18 +9,16 @@ import hashlib
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
-
-import hydra
-from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from typing import TYPE_CHECKING, Any
 
 from vecpsmbpo.algorithms.catalogue import build, check
 from vecpsmbpo.config.choices import GROUPS, default
 from vecpsmbpo.config.overrides import check_algorithm, check_env_values, first_line, name_of, parse
 from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import CHANGEABLE, SettingError, Settings
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 LONGEST_NAME = 200  # of a default run directory, in bytes; file systems take 255
 # What the name of a default run directory already says, or need not say.
@@ -41,6 +42,8 @@ def compose_point(experiment: str, overrides: Sequence[str]) -> Settings:
 
 
 def _compose(overrides: Sequence[str]) -> Settings:
+    import hydra
+
     with hydra_errors(), hydra.initialize_config_module("vecpsmbpo.configs", version_base="1.3"):
         tree = hydra.compose("config", for_hydra(overrides))
     return from_tree(tree, overrides)
@@ -49,6 +52,9 @@ def _compose(overrides: Sequence[str]) -> Settings:
 @contextlib.contextmanager
 def hydra_errors() -> Iterator[None]:
     """Turns what Hydra complains of into one line."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:
@@ -60,7 +66,7 @@ def for_hydra(overrides: Iterable[str]) -> list[str]:
     return [f"++{text}" if text.startswith("sweep.") else text for text in overrides]
 
 
-def from_tree(tree: DictConfig, overrides: Sequence[str]) -> Settings:
+def from_tree(tree: "DictConfig", overrides: Sequence[str]) -> Settings:
     """Settings from what Hydra composed, with the backend and the run directory resolved.
 
     Args:
@@ -69,6 +75,8 @@ def from_tree(tree: DictConfig, overrides: Sequence[str]) -> Settings:
     Raises:
         SettingError: a value that is missing, of another type or out of range, or settings that contradict one another.
     """
+    from omegaconf import OmegaConf
+
     with hydra_errors():
         values: Any = OmegaConf.to_container(tree, resolve=True)
     values["sweep"] = values["sweep"] or {}

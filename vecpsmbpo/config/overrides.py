@@ -2,16 +2,16 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
 
 from vecpsmbpo.algorithms.catalogue import FIELDS, check, check_sweep, require, told_apart
 from vecpsmbpo.config.choices import GROUPS, closest, default, env_options, options
 from vecpsmbpo.settings import SettingError
+
+if TYPE_CHECKING:
+    from hydra.core.override_parser.types import Override
 
 MOST_VALUES = 10_000  # of one setting in a grid; a typing error may make it endless
 
@@ -34,10 +34,7 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
     for text in overrides:
         if "=" not in text:
             raise SettingError(f"{text}: must be name=value")
-        try:
-            override = OverridesParser.create().parse_override(text)
-        except HydraException as error:
-            raise SettingError(f"{text}: is not a value that can be read ({first_line(error)})") from None
+        override = _read(text)
         name = override.key_or_group
         if override.is_delete():
             raise SettingError(f"{text}: a setting cannot be taken away; give it another value")
@@ -60,6 +57,17 @@ def parse(overrides: Sequence[str], *, sweep: bool = False) -> dict[str, Any]:
     return found
 
 
+def _read(text: str) -> "Override":
+    """As Hydra reads it."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        return OverridesParser.create().parse_override(text)
+    except HydraException as error:
+        raise SettingError(f"{text}: is not a value that can be read ({first_line(error)})") from None
+
+
 def name_of(text: str) -> str:
     """What an override names, `sweep.*` with Hydra's plus signs or without."""
     return text.partition("=")[0].lstrip("+")
@@ -67,7 +75,7 @@ def name_of(text: str) -> str:
 
 def chosen(group: str, text: str) -> list[str]:
     """The names that an override chooses of a group of Hydra's, quoted or not; none where it is of something else."""
-    override = OverridesParser.create().parse_override(text)
+    override = _read(text)
     value = override.value() if override.key_or_group == group else []
     return [str(name) for name in (value if isinstance(value, list) else [value])]
 
@@ -106,7 +114,9 @@ def check_algorithm(algo: str, names: Iterable[str]) -> None:
         require(algo, name)
 
 
-def _sweep_values(override: Override) -> list[Any]:
+def _sweep_values(override: "Override") -> list[Any]:
+    from hydra.errors import HydraException
+
     try:
         values = list(islice(override.sweep_iterator(), MOST_VALUES + 1))
     except HydraException:

@@ -3,9 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-from omegaconf import DictConfig
+from typing import TYPE_CHECKING, Any
 
 from vecpsmbpo import loggers
 from vecpsmbpo.algorithms.catalogue import build
@@ -16,8 +14,11 @@ from vecpsmbpo.config.stored import CONFIG_FILE, load
 from vecpsmbpo.envs import registry
 from vecpsmbpo.settings import SettingError, Settings
 
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
-def resolve(overrides: Sequence[str], tree: DictConfig | None = None) -> Settings:
+
+def resolve(overrides: Sequence[str], tree: "DictConfig | None" = None) -> Settings:
     """The settings of a run, new or resumed: a `run_dir` that holds one resumes with its own.
 
     Args:
@@ -34,7 +35,7 @@ def resolve(overrides: Sequence[str], tree: DictConfig | None = None) -> Setting
     return settings
 
 
-def _resolved(overrides: Sequence[str], tree: DictConfig | None) -> Settings:
+def _resolved(overrides: Sequence[str], tree: "DictConfig | None") -> Settings:
     given = parse(overrides, sweep=tree is not None)
 
     def new() -> Settings:
