@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vecpsmbpo import envs
     from vecpsmbpo.api import Policy, Run
     from vecpsmbpo.settings import SettingError
 
