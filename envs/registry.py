@@ -133,12 +133,8 @@ def make(name: str, backend: str = "auto", *, num_envs: int = 1, seed: int = 0, 
     try:
         found = getattr(importlib.import_module(f"vecpsmbpo.envs.{backend}.{module}"), attribute)
         with contextlib.chdir("."):  # to come back: a task that goes elsewhere must not take the run's files along
-            if backend == "mjx":
-                made = found(**options)
-            elif task.original:
-                made = found(num_envs=num_envs, seed=seed, name=name, **task.original, **options)
-            else:
-                made = found(num_envs=num_envs, seed=seed, **options)
+            own = {"name": name, **task.original} if task.original else {}
+            made = found(**options) if backend == "mjx" else found(num_envs=num_envs, seed=seed, **own, **options)
         if min(made.spec.obs_size, made.spec.action_size) < 1:
             sizes = f"{made.spec.obs_size} observation(s) and {made.spec.action_size} action(s)"
             raise SettingError(f"{which}: has {sizes}; it must have at least one of each")

@@ -2,16 +2,14 @@
 
 from vecpsmbpo.envs import termination
 from vecpsmbpo.envs.registry import TASKS
-from vecpsmbpo.types import EnvSpec, TerminationRule
+from vecpsmbpo.types import EnvSpec
 
 
 def get(name: str) -> EnvSpec:
     """The spec of one of the registry's own tasks."""
     task = TASKS[name]
     assert task.sizes is not None, f"{name} is a suite, not a task"
-    rule: TerminationRule = termination.never
-    if env_id := task.original.get("id"):
-        found = termination.of_gymnasium(env_id)
-        assert found, f"{env_id}: has no rule in `termination.OF_GYMNASIUM`"
-        rule = found
+    env_id = task.original.get("id")
+    rule = termination.of_gymnasium(env_id) if env_id else termination.never
+    assert rule is not None, f"{env_id}: has no rule in `termination.OF_GYMNASIUM`"
     return EnvSpec(name, *task.sizes, rule)
