@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -69,6 +70,21 @@ def test_a_table_of_curves_is_put_back_into_run_directories(tmp_path, capsys):
     assert "seconds" not in of_table[0]  # which comes last
     assert all(line.startswith(f"{part},") for line, part in zip(of_runs, of_table, strict=True))
     assert f"{back[0]}: seed 0, real_ratio 0.5 was frozen at step 120" in list(runs.warnings(runs.load_all(back)))
+
+
+def test_every_committed_table_of_curves_can_be_put_back(tmp_path):
+    """Its rows are read; one without `swept`, which older ones lack, becomes a run directory."""
+    results = Path(__file__).parents[1] / "results"
+    tables = [path for path in results.glob("**/*.csv") if path.read_text().startswith("run,")]
+    assert len(tables) > 30
+    for table in tables:
+        assert putback._runs_of(table), table
+    several = putback._runs_of(results / "adaptive_lambda.csv")["short_online"][0].numbers
+    assert several["real_ratio_probs"] == [0.2] * 5
+    words = ["env=halfcheetah", "size=cpu", "total_steps=17000"]
+    assert putback.main([str(results / "halfcheetah_unnormed.csv"), f"out={tmp_path}", *words]) == 0
+    (found,) = runs.load_all(list(tmp_path.iterdir()))
+    assert found.lanes[0].epochs["eval_return"].max() == pytest.approx(3538, abs=1)  # as docs/benchmark.md has it
 
 
 def test_mistakes_in_what_is_put_back(tmp_path):

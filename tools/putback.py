@@ -98,7 +98,7 @@ def _runs_of(table: Path) -> dict[str, list[Epoch]]:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SettingError(f"{table}: no table that can be read ({error})") from None
-    if not rows or not {"run", "swept", "env_steps", "seed"} <= rows[0].keys():
+    if not rows or not {"run", "env_steps", "seed"} <= rows[0].keys():
         raise SettingError(f"{table}: no table of curves, as plot out=FILE.csv writes it")
     runs: dict[str, list[Epoch]] = {}
     try:
@@ -111,10 +111,17 @@ def _runs_of(table: Path) -> dict[str, list[Epoch]]:
     return {name: sorted(epochs, key=lambda epoch: epoch.numbers[jsonl.STEP]) for name, epochs in runs.items()}
 
 
-def _epoch(swept: str, env_steps: str, seed: str, **numbers: str) -> Epoch:
+def _epoch(env_steps: str, seed: str, swept: str = "", **numbers: str) -> Epoch:
+    """`swept` is missing in tables that were written before there were sweeps."""
     values = {name: float(value) for name, value in (word.split("=") for word in swept.split())}
-    others = {name: float(value) if value else None for name, value in numbers.items()}
+    others = {name: _number(text) for name, text in numbers.items()}
     return Epoch(_name({"seed": int(seed), **values}), {jsonl.STEP: int(env_steps), **others})
+
+
+def _number(text: str) -> float | list[float] | None:
+    """What metrics.jsonl had: nothing, a number, or several, as `real_ratio_probs` has."""
+    several = [float(number) for number in text.split()]
+    return several if len(several) > 1 else several[0] if several else None
 
 
 def _settings_of(words: Sequence[str], names: Sequence[str]) -> dict[str, Settings]:
