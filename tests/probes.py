@@ -102,7 +102,7 @@ class FailingProbe(Probe):
         fails = left == 0
         diverges = jnp.where(action[0] > 0.5, 1e20, jnp.nan)  # on its way there, and there
         obs = jnp.where(fails & (action[0] > 0), diverges, after.obs)
-        reward = jnp.where(fails & (action[0] <= 0), jnp.inf, after.reward)
+        reward = jnp.where(fails & (action[0] <= 0), jnp.where(action[0] < -0.5, jnp.nan, jnp.inf), after.reward)
         return after.replace(pipeline_state=left, obs=obs, reward=reward)
 
 
@@ -129,9 +129,11 @@ class FailingGymnasium(gymnasium.Env):
         reward = self.obs * (1 - float(action[0]) ** 2)
         self.obs, self.steps = 1 - self.obs, self.steps + 1
         fails = self.steps % 7 == 0
-        diverges = 1e20 if action[0] > 0.5 else 1e39  # on its way to infinity, and there in float32
+        # On its way to infinity, there in float32, and beyond.
+        diverges = 1e20 if action[0] > 0.6 else 1e39 if action[0] > 0.3 else np.nan
         obs = np.array([diverges if fails and action[0] > 0 else self.obs])
-        return obs, -np.inf if fails and action[0] <= 0 else reward, False, False, {}
+        fault = np.nan if action[0] < -0.5 else -np.inf
+        return obs, fault if fails and action[0] <= 0 else reward, False, False, {}
 
 
 # ── that draws itself, and is no MuJoCo task ────────────────────────────────────────────────────────────────────

@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -88,6 +89,26 @@ def test_an_exported_policy_is_loaded_as_a_run_is(trained, policy, capsys):
     capsys.readouterr()
     assert cli.main(["eval", f"run_dir={policy}", "episodes=2"]) == 0
     assert capsys.readouterr().out.splitlines()[-2].replace("│", " ").split()[:2] == ["1", "2"]
+
+
+# Somewhat less than ten episodes earn on average (docs/benchmark.md, "Trained policies").
+COMMITTED = {
+    "cartpole_swingup": 870,
+    "cartpole_swingup_sparse": 760,
+    "ball_in_cup": 900,
+    "window_open": -550,
+    "hopper": 3100,
+    "halfcheetah": 2390,
+    "walker2d": 430,
+    "ant": 850,
+}
+
+
+@pytest.mark.parametrize(("task", "earned"), COMMITTED.items(), ids=COMMITTED)
+def test_a_committed_policy_earns_what_is_said_of_it(task, earned):
+    policy = vecpsmbpo.load(Path(__file__).parents[1] / "results" / "policies" / task)
+    assert policy.settings.env == task
+    assert policy.evaluate(episodes=2, backend="host")["return"].mean() > earned
 
 
 def test_a_run_stays_one_when_its_policy_is_exported_into_it(trained, tmp_path):

@@ -1,20 +1,23 @@
 """The stabilisers of `recipe=stable`, each by hand, and that `recipe=paper` has none of them at any size."""
 
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 from flax import linen as nn
 
+import configs
 from vecpsmbpo import config, dynamics, networks, sac
 from vecpsmbpo.envs import registry, specs
 from vecpsmbpo.types import Hyper, Transition
 
 from .helpers import new_model, tiny
 
-OFF = {
+OFF = {  # what configs/recipe/*.yaml may switch on
     "whiten_targets": False,
     "nll_beta": 0.0,
     "reward_nll_beta": 0.0,
@@ -30,6 +33,13 @@ def test_the_paper_s_recipe_has_no_stabiliser_at_any_size(env, size):
     settings = config.compose([f"env={env}", f"size={size}", "recipe=paper", *options])
     assert {name: getattr(settings, name) for name in OFF} == OFF
     assert settings.recipe == "paper"
+
+
+def test_every_stabiliser_of_a_recipe_is_looked_for():
+    folder = Path(configs.__file__).parent / "recipe"
+    switched = {name: yaml.safe_load((folder / f"{name}.yaml").read_text()).keys() for name in ("paper", "stable")}
+    assert switched["paper"] - {"recipe"} == OFF.keys()
+    assert switched["stable"] - {"recipe"} <= OFF.keys()
 
 
 def test_a_laptop_takes_the_stable_recipe_and_the_command_line_wins():

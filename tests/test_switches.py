@@ -213,7 +213,7 @@ def test_what_is_chosen_can_be_recomputed_from_the_log(adapted):
 def valued():
     """Members drawn by what their critics promise: settings, algorithm, state, episodes, and values of a state's
     seed."""
-    settings, driver, state, lines, _ = run(weights="values", temperature=0.1)
+    settings, driver, state, lines, _ = run(weights="values", temperature=0.1, target_entropy=-0.25)
     parts = driver.layout.specs().seeds
     values = driver.layout.jit_shard_map(jax.vmap(driver.algorithm.values), (parts,), parts.key)
     return settings, driver.algorithm, state, lines, lambda seeds: values(seeds)[0]
@@ -229,11 +229,15 @@ def test_members_may_be_drawn_by_what_their_critics_promise(valued):
     assert not np.any(lines[0]["values"])  # nothing is known before the first start
     assert len(np.unique(lines[-1]["values"])) == settings.n_members
     nets, start = learner.nets, jnp.zeros(1)  # where every episode begins
+    seen = state.seeds.moments
+    possible = [float(reward[0]) / (1 - settings.discount) for reward in (seen.lowest_reward, seen.highest_reward)]
     for member, found in enumerate(values(state.seeds)):
         agent = jax.tree.map(lambda x, member=member: x[0, member], state.seeds.agents)
         action = jnp.tanh(nets.actor.distribution(agent.actor, start).loc)
-        by_hand = np.min(nets.critic.values(agent.critic, start, action))
-        assert found == pytest.approx(max(by_hand, 0.0), rel=1e-4)
+        later = settings.discount / (1 - settings.discount)
+        bonus = np.exp(agent.log_alpha) * settings.target_entropy * later  # of the entropy of all later actions
+        by_hand = np.min(nets.critic.values(agent.critic, start, action)) - bonus
+        assert found == pytest.approx(np.clip(by_hand, *possible), rel=1e-4)
 
 
 def test_no_member_promises_more_than_the_rewards_seen_allow_this_step_s_included(valued):

@@ -141,12 +141,14 @@ class PsMbpo(Algorithm):
         return Feedforward(feedforward.first_outputs(layers, self.spec.action_size))
 
     def values(self, state: SeedState) -> Float[Array, " members"] | None:
-        """min(Q_1, Q_2) of each member's mean action, averaged over the starts of the last episodes.
+        """min(Q_1, Q_2) of each member's mean action, averaged over the starts of the last episodes, without entropy.
 
         The paper offers value functions in place of accumulated returns (section 3.3, after Agarwal and Zhang, 2022):
         what a member expects to earn, in its own model's world, rather than what it has earned. Members are comparable
-        since all are asked about the same states, the real starts, and since none may promise more or less than the
-        rewards seen so far allow: a critic that runs away is not preferred for it.
+        since all are asked about the same states, the real starts; since the bonus that their soft critics have learned
+        for the entropy of all later actions, α H (γ + γ² + …) of a policy at its target H, is taken away, whatever
+        their α are; and since none may promise more or less than the rewards seen so far allow: a critic that runs away
+        is not preferred for it.
         """
         starts = state.own.starts
         if starts is None:
@@ -154,13 +156,15 @@ class PsMbpo(Algorithm):
         nets = self.nets
         begun = state.episode.index - (state.episode.length == 0)
         known = jnp.arange(posterior.STARTS) < begun
+        discount, target_entropy = state.hyper.discount, state.hyper.target_entropy
+        steps = 1 / jnp.maximum(1 - discount, 1e-6)  # 1 + γ + γ² + …
 
         def value(agent: Agent) -> jax.Array:
             action = nets.actor.distribution(agent.actor, starts).mode()
             q = jnp.minimum(*nets.critic.values(agent.critic, starts, action))
-            return jnp.sum(jnp.where(known, q, 0.0)) / jnp.maximum(jnp.sum(known), 1)
+            bonus = jnp.exp(agent.log_alpha) * target_entropy * discount * steps
+            return jnp.sum(jnp.where(known, q - bonus, 0.0)) / jnp.maximum(jnp.sum(known), 1)
 
-        steps = 1 / jnp.maximum(1 - state.hyper.discount, 1e-6)  # 1 + γ + γ² + …
         least, most = state.moments.lowest_reward * steps, state.moments.highest_reward * steps
         return jnp.clip(self.layout.all_members(jax.vmap(value)(state.agents)), least, most)
 
