@@ -14,7 +14,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from vecpsmbpo import networks, optim
 from vecpsmbpo.settings.parts import SacSettings
-from vecpsmbpo.types import EnvSpec, Hyper, Number, Params, Stats, Transition
+from vecpsmbpo.types import EnvSpec, Hyper, Number, Params, Stats, Transition, Whole
+
+LEAST_RATE = 0.05
 
 
 class SacStats(Stats):
@@ -192,6 +194,16 @@ def update(
         alpha_optimizer=alpha_optimizer,
         stats=jax.tree.map(jnp.add, agent.stats, news),
     )
+
+
+def cooled(hyper: Hyper, settings: SacSettings, env_steps: Whole) -> Hyper:
+    """With the learning rate of now: constant, but for a cooldown at the end of the run, in which it falls on a line to
+    `LEAST_RATE` of it. (Hägele et al., 2024, call it that, and find it as good as a rate that falls from the start.)"""
+    if not settings.policy_learning_rate_cooldown:
+        return hyper
+    length = settings.policy_learning_rate_cooldown * settings.total_steps
+    left = jnp.clip((settings.total_steps - env_steps) / length, LEAST_RATE, 1.0)
+    return hyper.replace(policy_learning_rate=hyper.policy_learning_rate * left)
 
 
 def updates(agent: Agent, batches: Transition, noise: Noise, hyper: Hyper, **how: Any) -> Agent:

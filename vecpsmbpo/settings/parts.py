@@ -51,6 +51,7 @@ class SacSettings(PolicySettings):
     """Of `sac` (A.2)."""
 
     policy_learning_rate: float = real(0, open_low=True, traced=True)
+    policy_learning_rate_cooldown: float = real(0, 1)
     policy_batch_size: int = whole(1, MOST_ROWS)
     updates_per_step: int = whole(1)
     discount: float = real(0, 1, traced=True)

@@ -290,7 +290,8 @@ class PsMbpo(Algorithm):
             how = {"target_every": settings.target_update_every, "mean": layout.mean_of_parts}
             return sac.updates(agent, batches, noise, hyper, nets=nets, **how)
 
-        return layout.map_local(update, state.agents, batches, noise, shared=(state.hyper,))
+        hyper = sac.cooled(state.hyper, settings, counters.env_steps)
+        return layout.map_local(update, state.agents, batches, noise, shared=(hyper,))
 
     def work(self, learning: np.ndarray, refreshes: np.ndarray) -> tuple[int, int]:
         settings = self.settings
