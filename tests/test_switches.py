@@ -10,12 +10,39 @@ import scipy.integrate
 import scipy.stats
 
 from tests import probes
-from tests.helpers import algorithm, assert_probabilities_follow, constant, new_model, tiny
+from tests.helpers import algorithm, assert_probabilities_follow, constant, initial, new_model, tiny
 from tests.learners import make_driver, settings_for
 from vecpsmbpo import dynamics, metrics, posterior, sac, schedule
 from vecpsmbpo.envs import specs
 from vecpsmbpo.programs import initial_inputs
 from vecpsmbpo.types import Counters, Hyper, Transition
+
+# ── a learning rate that cools down ──────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_learning_rate_falls_to_a_twentieth_in_the_last_share_of_the_run():
+    """Adam's first step moves a parameter by the learning rate: here log α, with 400 steps, the last 100 of which cool
+    down."""
+    rate = 0.01
+    settings = tiny(
+        n_models=1,
+        n_policies=1,
+        updates_per_step=1,
+        total_steps=400,
+        policy_learning_rate=rate,
+        policy_learning_rate_cooldown=0.25,
+        devices=1,
+    )
+    learner = algorithm(settings, probes.spec(False))
+    parts, state = learner.layout.specs(), initial(learner)
+    learn = learner.layout.jit_shard_map(
+        lambda c, s: schedule.over_seeds(learner.learn)(c, s, s.key), (parts.counters, parts.seeds), parts.seeds.agents
+    )
+    for step, left in ((100, 1.0), (300, 1.0), (350, 0.5), (395, 0.05), (400, 0.05)):
+        after = learn(Counters(jnp.int32(step), jnp.int32(16)), state)
+        moved = np.abs(after.log_alpha - state.agents.log_alpha)
+        np.testing.assert_allclose(moved, rate * left, rtol=1e-3)
+
 
 # ── forced exploration (equation 33) ─────────────────────────────────────────────────────────────────────────────
 
