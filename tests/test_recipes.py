@@ -23,6 +23,7 @@ OFF = {  # what configs/recipe/*.yaml may switch on
     "reward_nll_beta": 0.0,
     "critic_norm": "none",
     "target_update_every": 1,
+    "policy_learning_rate_cooldown": 0.0,
 }
 
 
