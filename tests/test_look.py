@@ -77,14 +77,13 @@ def test_every_committed_table_of_curves_can_be_put_back(tmp_path):
     results = Path(__file__).parents[1] / "results"
     tables = [path for path in results.glob("**/*.csv") if path.read_text().startswith("run,")]
     assert len(tables) > 30
-    for table in tables:
-        assert putback._runs_of(table), table
-    several = putback._runs_of(results / "adaptive_lambda.csv")["short_online"][0].numbers
-    assert several["real_ratio_probs"] == [0.2] * 5
+    found = {table.name: putback._runs_of(table) for table in tables}
+    assert all(found.values())
+    assert found["adaptive_lambda.csv"]["short_online"][0].numbers["real_ratio_probs"] == [0.2] * 5
     words = ["env=halfcheetah", "size=cpu", "total_steps=17000"]
     assert putback.main([str(results / "halfcheetah_unnormed.csv"), f"out={tmp_path}", *words]) == 0
-    (found,) = runs.load_all(list(tmp_path.iterdir()))
-    assert found.lanes[0].epochs["eval_return"].max() == pytest.approx(3538, abs=1)  # as docs/benchmark.md has it
+    (run,) = runs.load_all(list(tmp_path.iterdir()))
+    assert run.lanes[0].epochs["eval_return"].max() == pytest.approx(3538, abs=1)  # as docs/benchmark.md has it
 
 
 def test_mistakes_in_what_is_put_back(tmp_path):

@@ -16,7 +16,7 @@ from vecpsmbpo import networks, optim
 from vecpsmbpo.settings.parts import SacSettings
 from vecpsmbpo.types import EnvSpec, Hyper, Number, Params, Stats, Transition, Whole
 
-LEAST_RATE = 0.05
+LEAST_RATE = 0.05  # the share of the learning rate that a cooldown ends at
 
 
 class SacStats(Stats):
