@@ -3,18 +3,23 @@
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from tools.benches.timing import best_seconds
 from vecpsmbpo import config, envs, runtime
+from vecpsmbpo.drivers.host import _packed
 from vecpsmbpo.envs import registry
+from vecpsmbpo.layout import BY_SEED
 from vecpsmbpo.programs import initial_inputs, make_driver
+
+T = TypeVar("T")
 
 
 def bench_envs() -> Iterator[dict[str, Any]]:
@@ -91,8 +96,7 @@ def bench_host() -> Iterator[dict[str, Any]]:
 
 
 def bench_hosted() -> dict[str, Any]:
-    """Of a step around a simulator of the host what is neither the simulator nor learning: acting, observing, and the
-    way to the device and back."""
+    """What a step around a simulator of the host costs before anything is learned, and its parts."""
     settings = config.compose(["env=hopper", "size=cpu", "warmup_steps=1000", *sys.argv[2:], "backend=host"])
     runtime.configure(settings)
     driver = make_driver(settings)
@@ -100,18 +104,43 @@ def bench_hosted() -> dict[str, Any]:
     driver.compile(state)
     strides = settings.model_update_every // settings.stride
     state, _ = driver.run(state, strides)
-    seconds = []
-    for _ in range(2):
-        began = time.perf_counter()
-        state, _ = driver.run(state, strides)
-        seconds.append((time.perf_counter() - began) / settings.model_update_every)
-    lanes = len(settings.lanes)
-    simulator = lanes / host_steps(settings.env, lanes)["steps_per_s"]
+    began = time.perf_counter()
+    state, _ = driver.run(state, strides)
+    seconds = (time.perf_counter() - began) / settings.model_update_every
+    strides_measured = [hosted_parts(driver, state) for _ in range(10)]
+    parts = {name: min(one[name] for one in strides_measured) for name in strides_measured[0]}
+    parts["rest"] = seconds - sum(parts.values())  # to begin and to end a stride, mostly
     return {
         "task": settings.env,
-        "seeds": lanes,
+        "seeds": len(settings.lanes),
         "members": settings.n_members,
-        "ms_per_step": 1e3 * min(seconds),
-        "ms_of_simulator": 1e3 * simulator,
-        "ms_around_it": 1e3 * (min(seconds) - simulator),
+        "stride": settings.stride,
+        "ms_per_step": 1e3 * seconds,
+        **{f"ms_{name}": 1e3 * each for name, each in parts.items()},
     }
+
+
+def hosted_parts(driver: Any, state: Any) -> dict[str, float]:
+    """Seconds of each part of a step as `HostDriver.run` takes it, each waited for, where the run waits for the action
+    only: the action fetched, the simulator, what it says sent, the program dispatched, and computed."""
+    seconds = dict.fromkeys(("fetch", "simulator", "send", "dispatch", "compute"), 0.0)
+
+    def timed(name: str, part: Callable[[], T]) -> T:
+        began = time.perf_counter()
+        result = part()
+        if name in ("send", "compute"):
+            jax.block_until_ready(result)
+        seconds[name] += time.perf_counter() - began
+        return result
+
+    frozen, stride = np.zeros(driver.layout.num_lanes, bool), driver.settings.stride
+    state = jax.tree.map(jnp.copy, state)  # the program takes its input over
+    _, state, learning, acted = jax.block_until_ready(driver._begin(state))
+    for _ in range(stride):
+        action = timed("fetch", lambda acted=acted: np.asarray(acted.action))
+        step = timed("simulator", lambda action=action: driver._env.step(action, still=frozen))
+        sent = timed("send", lambda step=step: driver.layout.everywhere(_packed(step), BY_SEED))
+        given = state, acted, sent, learning
+        result = timed("dispatch", lambda given=given: driver._follow(*given))
+        state, _, acted = timed("compute", lambda result=result: result)
+    return {name: total / stride for name, total in seconds.items()}
