@@ -3,9 +3,9 @@
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any
 
 import gymnasium
 import jax
@@ -18,8 +18,6 @@ from vecpsmbpo.drivers.host import _packed
 from vecpsmbpo.envs import registry
 from vecpsmbpo.layout import BY_SEED
 from vecpsmbpo.programs import initial_inputs, make_driver
-
-T = TypeVar("T")
 
 
 def bench_envs() -> Iterator[dict[str, Any]]:
@@ -123,24 +121,22 @@ def bench_hosted() -> dict[str, Any]:
 def hosted_parts(driver: Any, state: Any) -> dict[str, float]:
     """Seconds of each part of a step as `HostDriver.run` takes it, each waited for, where the run waits for the action
     only: the action fetched, the simulator, what it says sent, the program dispatched, and computed."""
-    seconds = dict.fromkeys(("fetch", "simulator", "send", "dispatch", "compute"), 0.0)
-
-    def timed(name: str, part: Callable[[], T]) -> T:
-        began = time.perf_counter()
-        result = part()
-        if name in ("send", "compute"):
-            jax.block_until_ready(result)
-        seconds[name] += time.perf_counter() - began
-        return result
-
+    names = ("fetch", "simulator", "send", "dispatch", "compute")
     frozen, stride = np.zeros(driver.layout.num_lanes, bool), driver.settings.stride
     state = jax.tree.map(jnp.copy, state)  # the program takes its input over
     _, state, learning, acted = jax.block_until_ready(driver._begin(state))
+    seconds = np.zeros(len(names))
     for _ in range(stride):
-        action = timed("fetch", lambda acted=acted: np.asarray(acted.action))
-        step = timed("simulator", lambda action=action: driver._env.step(action, still=frozen))
-        sent = timed("send", lambda step=step: driver.layout.everywhere(_packed(step), BY_SEED))
-        given = state, acted, sent, learning
-        result = timed("dispatch", lambda given=given: driver._follow(*given))
-        state, _, acted = timed("compute", lambda result=result: result)
-    return {name: total / stride for name, total in seconds.items()}
+        times = [time.perf_counter()]
+        action = np.asarray(acted.action)
+        times.append(time.perf_counter())
+        step = driver._env.step(action, still=frozen)
+        times.append(time.perf_counter())
+        sent = jax.block_until_ready(driver.layout.everywhere(_packed(step), BY_SEED))
+        times.append(time.perf_counter())
+        state, end, acted = driver._follow(state, acted, sent, learning)
+        times.append(time.perf_counter())
+        jax.block_until_ready((state, end, acted))
+        times.append(time.perf_counter())
+        seconds += np.diff(times)
+    return dict(zip(names, (seconds / stride).tolist(), strict=True))
