@@ -78,6 +78,7 @@ def diagnosis(checkpoints: int = 1, *, n_models: int = 2, horizon: int = 4, obs_
                 "levels": (0.5, 0.9),
                 "coverage": np.full((n_models, 2, obs_size + 1), 0.7),
                 "histogram": np.ones((n_models, 5)),
+                "reliability": {name: np.full((n_models, 3), 0.1) for name in ("expected", "made")},
             },
             "critics": {
                 "members": ["0,0", "1,0"],

@@ -116,14 +116,34 @@ def test_calibration_of_a_normal_world(believed):
     """With σ_model = c σ, the central interval of level p holds 2 Φ(c z) - 1 of what happens."""
     seen = _windows(0.9, 0.2, 20_000)
     models = _together(_linear_model(0.9, 1.0, 0.2 * believed))
-    residuals = diagnostics.residuals(models, seen.obs, seen.action[:, 0], seen.truth[:, 0], net=NET)
-    found = diagnostics.calibration(np.asarray(residuals))
+    ahead = diagnostics.one_step(models, seen.obs, seen.action[:, 0], seen.truth[:, 0], net=NET)
+    found = diagnostics.calibration(ahead)
     for index, level in enumerate(diagnostics.LEVELS):
         expected = 2 * norm.cdf(believed * norm.ppf(0.5 + level / 2)) - 1
         np.testing.assert_allclose(found.coverage[0, index], expected, atol=0.01)
     assert found.histogram.mean() == pytest.approx(1)
     edges = norm.ppf(np.linspace(0, 1, diagnostics.BINS + 1)) * believed
     np.testing.assert_allclose(found.histogram[0], np.diff(norm.cdf(edges)) * diagnostics.BINS, atol=0.2)
+
+
+def test_a_model_that_gives_up_a_hundredth_is_seen_to():
+    """Errors of 1 everywhere; 1 is expected of 99 in 100, 20 of the rest: of all intervals only those are too wide."""
+    random = np.random.default_rng(0)
+    error = random.normal(size=(1, 100_000, 1)) * 3
+    expected = np.full_like(error, 3)
+    expected[0, ::100] *= 20
+    ahead = diagnostics.OneStep(error, expected)
+    np.testing.assert_allclose(diagnostics.calibration(ahead).coverage[0, :, 0], diagnostics.LEVELS, atol=0.01)
+    found = diagnostics.reliability(ahead, np.array([3.0]))
+    np.testing.assert_allclose(found.expected[0], [1] * 12 + [20] * 2, rtol=1e-6)
+    np.testing.assert_allclose(found.made[0], np.ones(14), rtol=0.2)
+
+
+def test_reliability_of_dimensions_that_do_not_vary_or_few_rows():
+    ahead = diagnostics.OneStep(np.full((2, 3, 2), 0.5), np.array([0.1, 0.4]) * np.ones((2, 3, 2)))
+    found = diagnostics.reliability(ahead, np.array([0.0, 2.0]))
+    np.testing.assert_allclose(found.expected, 0.2)
+    np.testing.assert_allclose(found.made, 0.25)
 
 
 # ── critics ───────────────────────────────────────────────────────────────────────────────────────────────────────

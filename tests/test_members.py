@@ -66,6 +66,7 @@ def test_a_run_is_diagnosed_and_its_report_says_so(trained, tmp_path, monkeypatc
     models = found["models"]
     assert np.shape(models["error"]) == np.shape(models["expected"]) == (2, 4, 6)
     assert np.shape(models["coverage"]) == (2, 3, 6)
+    assert np.shape(models["reliability"]["made"]) == (2, 14)
     assert found["critics"]["members"] == ["0,0", "0,1", "1,0", "1,1"]
     assert found["critics"]["states"] == 4 * 25  # what lies beyond the time limit is seen, too
     difference = found["critics"]["q"] - found["critics"]["earned"]

@@ -197,8 +197,8 @@ class _Probe:
         steps = np.argwhere(seen.there[:, : self._length])
         rows = tuple(steps[random.permutation(len(steps))[: diagnostics.ROWS]].T)
         truth = np.concatenate([seen.next_obs[rows], seen.reward[rows][:, None]], axis=-1)
-        residuals = diagnostics.residuals(models, seen.obs[rows], seen.action[rows], truth, net=net)
-        calibration = diagnostics.calibration(np.asarray(residuals))
+        ahead = diagnostics.one_step(models, seen.obs[rows], seen.action[rows], truth, net=net)
+        ahead = diagnostics.OneStep(*map(np.asarray, ahead))
         std = truth.std(axis=0)
         return {
             "dimensions": [*(f"obs {index}" for index in range(spec.obs_size)), "reward"],
@@ -207,7 +207,8 @@ class _Probe:
             **errors._asdict(),
             "relative": {name: diagnostics.relative(values, std) for name, values in errors._asdict().items()},
             "levels": diagnostics.LEVELS,
-            **calibration._asdict(),
+            **diagnostics.calibration(ahead)._asdict(),
+            "reliability": diagnostics.reliability(ahead, std)._asdict(),
         }
 
     def _critics(self, trained: "Trained", seen: Any, random: np.random.Generator) -> dict[str, Any] | None:

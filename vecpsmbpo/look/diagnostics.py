@@ -24,6 +24,7 @@ WINDOWS = 256  # W, where there are as many
 ROWS = 4000  # transitions that calibration is measured on
 LEVELS = (0.5, 0.9, 0.95)  # of intervals
 BINS = 20  # of the histogram of probability integral transforms
+QUANTILES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995)  # between groups
 TAIL = 0.01  # of a state's return may lie beyond what was seen of it
 
 
@@ -137,19 +138,26 @@ def _mean(values: Array, there: Array) -> Array:
         return np.where(there[..., None], values, 0.0).sum(axis=-3) / count
 
 
-@partial(jax.jit, static_argnames="net")
-def residuals(
-    models: Model, obs: jax.Array, action: jax.Array, truth: jax.Array, *, net: networks.GaussianMLP
-) -> jax.Array:
-    """(y - μ) / σ of what each model said of the next observations and rewards truth [B, D]: [N, B, D].
-
-    Standard normal for a model that is right (equation 20).
+class OneStep(NamedTuple):
+    """Attributes:
+    error: [N, B, D], what happened less the mean that a model predicted for it.
+    expected: [N, B, D], the deviation that it predicted.
     """
+
+    error: Any
+    expected: Any
+
+
+@partial(jax.jit, static_argnames="net")
+def one_step(
+    models: Model, obs: jax.Array, action: jax.Array, truth: jax.Array, *, net: networks.GaussianMLP
+) -> OneStep:
+    """What each model says of the next observations and rewards truth [B, D] (equation 20)."""
     start = jnp.concatenate([obs, jnp.zeros_like(obs[:, :1])], axis=-1)
 
     def of_model(model):
         said = dynamics.forward(model, obs, action, net=net)
-        return (truth - start - said.mean) * jnp.exp(-0.5 * said.log_variance)
+        return OneStep(truth - start - said.mean, jnp.exp(0.5 * said.log_variance))
 
     return jax.lax.map(of_model, models)
 
@@ -165,13 +173,44 @@ class Calibration(NamedTuple):
     histogram: Array
 
 
-def calibration(residuals: Array) -> Calibration:
-    """Of residuals [N, B, D]."""
+def calibration(ahead: OneStep) -> Calibration:
+    """Error / expected is standard normal for a model that is right."""
+    residuals = ahead.error / ahead.expected
     bounds = norm.ppf(0.5 + np.array(LEVELS) / 2)
     coverage = (np.abs(residuals)[:, None] <= bounds[:, None, None]).mean(axis=2)
     places: Any = norm.cdf(residuals).reshape(len(residuals), -1)
     counts = [np.histogram(one, bins=BINS, range=(0, 1))[0] for one in places]
     return Calibration(coverage, np.stack(counts) * BINS / places.shape[1])
+
+
+class Reliability(NamedTuple):
+    """Root mean squares over the predictions whose expected errors are alike, from the smallest to the largest.
+
+    Attributes:
+        expected: [N, Q], of the deviations that the model predicted for them.
+        made: [N, Q], of its errors: the same for a model that is right.
+    """
+
+    expected: Array
+    made: Array
+
+
+def reliability(ahead: OneStep, std: Array) -> Reliability:
+    """Of all dimensions that vary, each in units of its deviation `std` [D]; Q groups, between `QUANTILES`.
+
+    What calibration does not show: intervals hold as much as they should while a few predictions, which rollouts meet
+    sooner or later, are given up.
+    """
+    varies = std > 0
+    error, expected = (x[..., varies].astype(float) / std[varies] for x in ahead)
+    error, expected = (x.reshape(len(x), -1) for x in (error, expected))
+    order = np.argsort(expected, axis=1)
+    groups = np.split(order, np.round(np.array(QUANTILES) * order.shape[1]).astype(int), axis=1)
+    of_groups = lambda values: np.stack(  # noqa: E731
+        [np.sqrt((np.take_along_axis(values, group, axis=1) ** 2).mean(axis=1)) for group in groups if group.size],
+        axis=1,
+    )
+    return Reliability(of_groups(expected), of_groups(error))
 
 
 # ── critics ───────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -115,6 +115,14 @@ def _model_panels(models: dict[str, Any]) -> Iterator[Panel]:
         f"{shares}",
         lambda axes: _draw_calibration(axes, models),
     )
+    if reliability := models.get("reliability"):  # diagnoses of before have none
+        yield Panel(
+            "errors made against expected",
+            "one step ahead, predictions grouped by the error that the model expected of them, tenths and the last "
+            "tenth finer (all dimensions, each in its standard deviations; root mean squares): on the line for a "
+            "model that is right; below it rollouts are scattered more than the world is, above it less",
+            lambda axes: _draw_reliability(axes, reliability),
+        )
 
 
 def _array(values: Any) -> Array:
@@ -172,6 +180,22 @@ def _draw_calibration(axes: Axes, models: dict[str, Any]) -> None:
     axes.set_ylim(bottom=0)
     axes.set_xlabel("place in the predicted distribution")
     axes.set_ylabel("density of what happened")
+    axes.legend(fontsize=7, ncols=2)
+
+
+def _draw_reliability(axes: Axes, reliability: dict[str, Any]) -> None:
+    expected, made = (_array(reliability[name]) for name in ("expected", "made"))
+    for index, look in enumerate(style.looks(len(expected))):
+        axes.plot(expected[index], made[index], "o-", ms=3, lw=1, color=look.colour, label=f"model {index}")
+    known = np.concatenate([expected.ravel(), made.ravel()])
+    known = known[np.isfinite(known) & (known > 0)]
+    if len(known):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        ends = [known.min(), known.max()]
+        axes.plot(ends, ends, label="were it right", **GREY)
+    axes.set_xlabel("error expected, in standard deviations")
+    axes.set_ylabel("error made")
     axes.legend(fontsize=7, ncols=2)
 
 
