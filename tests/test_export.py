@@ -97,17 +97,18 @@ COMMITTED = {
     "cartpole_swingup_sparse": 760,
     "ball_in_cup": 900,
     "window_open": -550,
-    "hopper": 3100,
+    "hopper": 2730,
+    "hopper_mbpo": 3100,
     "halfcheetah": 2390,
     "walker2d": 430,
     "ant": 850,
 }
 
 
-@pytest.mark.parametrize(("task", "earned"), COMMITTED.items(), ids=COMMITTED)
-def test_a_committed_policy_earns_what_is_said_of_it(task, earned):
-    policy = vecpsmbpo.load(Path(__file__).parents[1] / "results" / "policies" / task)
-    assert policy.settings.env == task
+@pytest.mark.parametrize(("name", "earned"), COMMITTED.items(), ids=COMMITTED)
+def test_a_committed_policy_earns_what_is_said_of_it(name, earned):
+    policy = vecpsmbpo.load(Path(__file__).parents[1] / "results" / "policies" / name)
+    assert policy.settings.env == name.removesuffix("_mbpo")
     assert policy.evaluate(episodes=2, backend="host")["return"].mean() > earned
 
 
