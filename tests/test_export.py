@@ -99,7 +99,7 @@ COMMITTED = {
     "window_open": -550,
     "hopper": 2730,
     "hopper_mbpo": 3100,
-    "halfcheetah": 2390,
+    "halfcheetah": 7150,
     "walker2d": 430,
     "ant": 850,
 }
