@@ -100,7 +100,7 @@ COMMITTED = {
     "hopper": 2730,
     "hopper_mbpo": 3100,
     "halfcheetah": 7150,
-    "walker2d": 430,
+    "walker2d": 1750,
     "ant": 850,
 }
 
