@@ -202,14 +202,14 @@ def reliability(ahead: OneStep, std: Array) -> Reliability:
     sooner or later, are given up.
     """
     varies = std > 0
-    error, expected = (x[..., varies].astype(float) / std[varies] for x in ahead)
-    error, expected = (x.reshape(len(x), -1) for x in (error, expected))
+    error, expected = ((x[..., varies].astype(float) / std[varies]).reshape(len(x), -1) for x in ahead)
     order = np.argsort(expected, axis=1)
-    groups = np.split(order, np.round(np.array(QUANTILES) * order.shape[1]).astype(int), axis=1)
-    of_groups = lambda values: np.stack(  # noqa: E731
-        [np.sqrt((np.take_along_axis(values, group, axis=1) ** 2).mean(axis=1)) for group in groups if group.size],
-        axis=1,
-    )
+    edges = np.round(np.array(QUANTILES) * order.shape[1]).astype(int)
+
+    def of_groups(values: Array) -> Array:
+        groups = np.split(np.take_along_axis(values, order, axis=1) ** 2, edges, axis=1)
+        return np.sqrt(np.stack([group.mean(axis=1) for group in groups if group.size], axis=1))
+
     return Reliability(of_groups(expected), of_groups(error))
 
 
