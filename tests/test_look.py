@@ -72,6 +72,29 @@ def test_a_table_of_curves_is_put_back_into_run_directories(tmp_path, capsys):
     assert f"{back[0]}: seed 0, real_ratio 0.5 was frozen at step 120" in list(runs.warnings(runs.load_all(back)))
 
 
+def test_a_table_of_episodes_is_put_back_with_the_curves(tmp_path, capsys):
+    """By seed and swept value; of two runs, or of a lane that there is not, it is refused and nothing written."""
+    curves, episodes = tmp_path / "curves.csv", tmp_path / "episodes.csv"
+    rows = "".join(f"a,real_ratio={value},40,{seed},1\n" for value in (0, 0.1) for seed in (0, 1))
+    curves.write_text("run,swept,env_steps,seed,eval_return\n" + rows)
+    episodes.write_text("real_ratio,seed,env_steps,return\n0,0,25,1.5\n0.1,1,30,-2\n")
+    words = [f"out={tmp_path / 'out'}", "env=cartpole_swingup", "size=tiny", "num_seeds=2", "sweep.real_ratio=[0,0.1]"]
+    assert putback.main([str(curves), f"episodes={episodes}", *words]) == 0
+    assert [json.loads(line) for line in (tmp_path / "out" / "a" / "episodes.jsonl").read_text().splitlines()] == [
+        {"seed": 0, "real_ratio": 0.0, "env_steps": 25, "return": 1.5},
+        {"seed": 1, "real_ratio": 0.1, "env_steps": 30, "return": -2.0},
+    ]
+    words[0] = f"out={tmp_path / 'none'}"
+    for text in ("real_ratio,seed,env_steps,return\n0,2,25,1.5\n", "seed,env_steps\n0,25\n"):
+        episodes.write_text(text)
+        with pytest.raises(SettingError, match="is not of this run"):
+            putback.main([str(curves), f"episodes={episodes}", *words])
+    curves.write_text(curves.read_text() + rows.replace("a,", "b,"))
+    with pytest.raises(SettingError, match="is of one run, and there are 2"):
+        putback.main([str(curves), f"episodes={episodes}", *words])
+    assert not (tmp_path / "none").exists()
+
+
 def test_every_committed_table_of_curves_can_be_put_back(tmp_path):
     """Its rows are read; one without `swept`, which older ones lack, becomes a run directory."""
     results = Path(__file__).parents[1] / "results"

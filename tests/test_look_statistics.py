@@ -26,6 +26,12 @@ def test_statistics_by_hand():
     assert statistics.probability_of_improvement(one, one) == 0.5
 
 
+def test_scores_that_differ_by_rounding_alone_are_tied():
+    one, other = np.array([0.1 + 0.2, 0.0]), np.array([0.3, 0.0])
+    assert one[0] != other[0]
+    assert statistics.probability_of_improvement([one], [other]) == (0.5 + 1 + 0 + 0.5) / 4
+
+
 def test_the_probability_of_improvement_is_mann_whitney_s(tmp_path):
     random = np.random.default_rng(0)
     one, other = random.normal(0.3, 1, 9), random.normal(0, 1, 7)

@@ -8,7 +8,10 @@ name (`runs/fig5` has one of PS-MBPO, and ten seeds of OPS-MBPO):
 
     python tools/putback.py ... env=ball_in_cup size=cpu num_seeds=5 ball: num_seeds=10 ball_ps_mbpo: algo=ps_mbpo
 
-What a table does not have, its runs do not have either: there are no episodes and checkpoints to look at.
+What a table does not have, its runs do not have either: there are no checkpoints to look at, and no episodes but those
+that `episodes=FILE.csv` has of a single run, by its seed and swept values:
+
+    python tools/putback.py results/real_ratio.csv episodes=results/real_ratio_episodes.csv ...
 """
 
 import csv
@@ -23,7 +26,10 @@ from vecpsmbpo.jsonl import EPISODES_FILE, METRICS_FILE
 from vecpsmbpo.look import files
 from vecpsmbpo.settings import SettingError, Settings
 
-OPTIONS = {"out": arguments.out("where the run directories go", "runs/putback")}
+OPTIONS = {
+    "out": arguments.out("where the run directories go", "runs/putback"),
+    "episodes": arguments.text("a table of the episodes, of a single run", allowed="a file"),
+}
 
 
 class Epoch(NamedTuple):
@@ -43,6 +49,11 @@ def _name(lane: Mapping[str, Any]) -> str:
     return " ".join(f"{name}={float(value):g}" for name, value in lane.items())
 
 
+def _lanes_of(settings: Settings) -> dict[str, dict[str, Any]]:
+    """What each lane is marked with in the logs, by its name: the values as the settings have them, all digits."""
+    return {_name(lane): metrics.lane_of(settings, index) for index, lane in enumerate(settings.lanes)}
+
+
 def main(words: Sequence[str]) -> int:
     """The tool; its exit status.
 
@@ -58,12 +69,12 @@ def main(words: Sequence[str]) -> int:
     settings = _settings_of(rest, list(runs))
     for name, epochs in runs.items():
         _check(options["out"], name, settings[name], epochs)
+    episodes = _episodes_of(Path(options["episodes"]), list(settings.values())) if options["episodes"] else b""
     for name, epochs in runs.items():
         folder = options["out"] / name
-        # The values as the settings have them: the table has six digits of each.
-        lanes = {_name(lane): metrics.lane_of(settings[name], index) for index, lane in enumerate(settings[name].lanes)}
+        lanes = _lanes_of(settings[name])
         text = "".join(jsonl.text_of(lanes[epoch.lane] | epoch.numbers) for epoch in epochs)
-        files.write_together(folder, {METRICS_FILE: text.encode(), EPISODES_FILE: b""})
+        files.write_together(folder, {METRICS_FILE: text.encode(), EPISODES_FILE: episodes})
         config.save(dataclasses.replace(settings[name], run_dir=str(folder)), folder)
         print(f"written: {folder}")
     return 0
@@ -93,11 +104,7 @@ def _runs_of(table: Path) -> dict[str, list[Epoch]]:
     Raises:
         SettingError: it is no table that `plot` writes.
     """
-    try:
-        with table.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SettingError(f"{table}: no table that can be read ({error})") from None
+    rows = _rows_of(table)
     if not rows or not {"run", "env_steps", "seed"} <= rows[0].keys():
         raise SettingError(f"{table}: no table of curves, as plot out=FILE.csv writes it")
     runs: dict[str, list[Epoch]] = {}
@@ -111,11 +118,44 @@ def _runs_of(table: Path) -> dict[str, list[Epoch]]:
     return {name: sorted(epochs, key=lambda epoch: epoch.numbers[jsonl.STEP]) for name, epochs in runs.items()}
 
 
+def _rows_of(table: Path) -> list[dict[str, str]]:
+    """By the names of the columns.
+
+    Raises:
+        SettingError: it is no table that can be read.
+    """
+    try:
+        with table.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SettingError(f"{table}: no table that can be read ({error})") from None
+
+
 def _epoch(env_steps: str, seed: str, swept: str = "", **numbers: str) -> Epoch:
     """`swept` is missing in tables that were written before there were sweeps."""
     values = {name: float(value) for name, value in (word.split("=") for word in swept.split())}
     others = {name: _number(text) for name, text in numbers.items()}
     return Epoch(_name({"seed": int(seed), **values}), {jsonl.STEP: int(env_steps), **others})
+
+
+def _episodes_of(table: Path, settings: Sequence[Settings]) -> bytes:
+    """episodes.jsonl of a table that has each episode's seed, swept values and numbers.
+
+    Raises:
+        SettingError: it cannot be read, or is not of the one run whose settings these are.
+    """
+    if len(settings) != 1:
+        raise SettingError(f"episodes={table}: is of one run, and there are {len(settings)}")
+    lanes = _lanes_of(settings[0])
+    lines = []
+    for row in _rows_of(table):
+        try:
+            lane = lanes[_name({name: row.pop(name) for name in settings[0].lanes[0]})]
+            numbers = {name: _number(text) for name, text in row.items()}
+            lines.append(jsonl.text_of(lane | numbers | {jsonl.STEP: int(row[jsonl.STEP])}))
+        except (KeyError, ValueError, TypeError) as error:
+            raise SettingError(f"{table}: has a row that is not of this run ({error})") from None
+    return "".join(lines).encode()
 
 
 def _number(text: str) -> float | list[float] | None:

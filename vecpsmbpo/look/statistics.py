@@ -45,7 +45,10 @@ def probability_of_improvement(scores: Scores, others: Scores) -> float:
 
 def _wins(one: Array, other: Array) -> float:
     differences = one[:, None] - other[None, :]
-    return float(np.mean(np.where(np.isnan(differences), np.nan, (differences > 0) + 0.5 * (differences == 0))))
+    # Means of the same returns, added up in another order or read from rounded numbers, are a tie.
+    tied = np.isclose(one[:, None], other[None, :], rtol=1e-6, atol=0)
+    won = np.where(tied, 0.5, differences > 0)
+    return float(np.mean(np.where(np.isnan(differences), np.nan, won)))
 
 
 def bootstrap(statistic: Callable[..., float], *samples: Scores, seed: int = 0, resamples: int = RESAMPLES) -> Estimate:
