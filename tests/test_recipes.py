@@ -1,6 +1,5 @@
 """The stabilisers of `recipe=stable`, each by hand, and that `recipe=paper` has none of them at any size."""
 
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -11,9 +10,9 @@ import yaml
 from flax import linen as nn
 
 import configs
-from vecpsmbpo import config, dynamics, networks, sac
+from vecpsmbpo import config, dynamics, networks
 from vecpsmbpo.envs import registry, specs
-from vecpsmbpo.types import Hyper, Transition
+from vecpsmbpo.types import Transition
 
 from .helpers import new_model, tiny
 
@@ -22,7 +21,6 @@ OFF = {  # what configs/recipe/*.yaml may switch on
     "nll_beta": 0.0,
     "reward_nll_beta": 0.0,
     "critic_norm": "none",
-    "target_update_every": 1,
     "policy_learning_rate_cooldown": 0.0,
 }
 
@@ -125,19 +123,3 @@ def test_what_is_poorly_predicted_counts_by_beta(beta, key):
     slope = jax.nn.sigmoid(most - free) * jax.nn.sigmoid(most - jax.nn.softplus(most - free) + 10)
     expected = jnp.mean(slope * (deviation**powers - error**2 * deviation ** (powers - 2)) / 2, axis=0) / len(units)
     np.testing.assert_allclose(of_variance, expected, rtol=1e-3, atol=1e-6)
-
-
-def test_the_target_critic_moves_at_every_fourth_update(key):
-    spec, settings = specs.get("hopper"), tiny()
-    nets = sac.make_networks(settings, spec)
-    update = jax.jit(partial(sac.update, nets=nets, target_every=4))
-    agent, hyper = sac.init(key, nets, spec), Hyper.of(settings)
-    obs = jnp.ones((2, spec.obs_size))
-    batch = Transition(obs, jnp.zeros((2, spec.action_size)), jnp.ones(2), obs, jnp.zeros(2))
-    moved = []
-    for step in range(8):
-        noise = sac.Noise.draw(jax.random.fold_in(key, step), batch.action.shape)
-        before, agent = agent, update(agent, batch, noise, hyper)
-        same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), before.target_critic, agent.target_critic)
-        moved.append(not all(jax.tree.leaves(same)))
-    assert moved == [False, False, False, True] * 2

@@ -9,7 +9,12 @@ from vecpsmbpo.settings import SettingError, Settings
 SHOWN = 6  # contradictions that a line names
 
 # Settings that there were, and the value with which they did nothing.
-RETIRED = {"policy_learning_rate_decay": 1.0, "clip_targets": False, "bound_log_prob": False}
+RETIRED = {
+    "policy_learning_rate_decay": 1.0,
+    "clip_targets": False,
+    "bound_log_prob": False,
+    "target_update_every": 1,
+}
 
 
 def plain(settings: Settings) -> dict[str, Any]:

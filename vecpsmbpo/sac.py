@@ -141,11 +141,9 @@ def update(
     hyper: Hyper,
     *,
     nets: Networks,
-    target_every: int = 1,
     mean: Callable[[Any], Any] = lambda parts: parts,
 ) -> Agent:
-    """One gradient step of critic, actor and α, and every `target_every` such steps one of the target
-    critic's average.
+    """One gradient step of critic, actor and α, and one of the target critic's average.
 
     Args:
         batch: leaves [B, ...].
@@ -170,11 +168,9 @@ def update(
     alpha_gradient = -alpha * (log_prob + hyper.target_entropy)
     log_alpha, alpha_optimizer = optim.step(alpha_gradient, agent.alpha_optimizer, agent.log_alpha, rate)
 
-    due = critic_optimizer.count % target_every == 0
-    target_rate = jnp.where(due, hyper.target_update_rate, 0.0)
     # Not optax.incremental_update, which rounds both of its products: an average moves by less than they are wrong.
     target_critic = jax.tree.map(
-        lambda average, new: average + target_rate * (new - average), agent.target_critic, critic
+        lambda average, new: average + hyper.target_update_rate * (new - average), agent.target_critic, critic
     )
     news = SacStats(
         updates=jnp.ones(()),

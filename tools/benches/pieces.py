@@ -34,7 +34,7 @@ def pieces_of_update(settings: Settings) -> dict[str, int]:
         return sac.init(key, nets, spec), batches, noise, Hyper.of(settings)
 
     def run(agent: Any, batches: Any, noise: Any, hyper: Hyper) -> Any:
-        return sac.updates(agent, batches, noise, hyper, nets=nets, target_every=settings.target_update_every)
+        return sac.updates(agent, batches, noise, hyper, nets=nets)
 
     return loop_pieces(jax.jit(run).lower(*jax.eval_shape(inputs)).compile().as_text())
 

@@ -57,7 +57,6 @@ class SacSettings(PolicySettings):
     discount: float = real(0, 1, traced=True)
     target_entropy: float = real(traced=True)
     target_update_rate: float = real(0, 1, open_low=True, traced=True)
-    target_update_every: int = whole(1)
     critic_norm: str = choice("none", "layer")
 
     @property

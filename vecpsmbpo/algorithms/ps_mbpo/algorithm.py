@@ -287,8 +287,7 @@ class PsMbpo(Algorithm):
         batches, noise = layout.part((batches, noise), axis=2)
 
         def update(agent, batches, noise, hyper):
-            how = {"target_every": settings.target_update_every, "mean": layout.mean_of_parts}
-            return sac.updates(agent, batches, noise, hyper, nets=nets, **how)
+            return sac.updates(agent, batches, noise, hyper, nets=nets, mean=layout.mean_of_parts)
 
         hyper = sac.cooled(state.hyper, settings, counters.env_steps)
         return layout.map_local(update, state.agents, batches, noise, shared=(hyper,))
