@@ -1,5 +1,9 @@
 """What `tools/bench.py pieces` counts, and that an update does not fall into more pieces unnoticed."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -35,3 +39,10 @@ def test_an_update_is_41_products_and_the_norm_s_means(norm, means):
     assert found["products"] == 41 + means
     assert found["fusions"] <= 1.1 * FUSIONS[norm]
     assert found["copies"] <= 1.1 * COPIES
+
+
+def test_a_mistake_in_what_is_measured_is_a_line():
+    """Of the benches that compose settings, too, not of the peer's alone."""
+    tool = Path(__file__).parents[1] / "tools" / "bench.py"
+    done = subprocess.run([sys.executable, tool, "pieces", "env=hoper"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "bench: env=hoper: did you mean hopper?\n")

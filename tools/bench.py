@@ -29,11 +29,7 @@ from vecpsmbpo.settings import SettingError
 
 
 def bench_compare() -> dict[str, Any]:
-    try:
-        return peer.compare(sys.argv[2:])
-    except SettingError as error:
-        print(f"bench: {error}", file=sys.stderr)
-        sys.exit(2)
+    return peer.compare(sys.argv[2:])
 
 
 BENCHES = {
@@ -55,8 +51,13 @@ if __name__ == "__main__":
         print(f"bench: takes one of {', '.join(BENCHES)}, then settings", file=sys.stderr)
         sys.exit(2)
     about = {"bench": sys.argv[1], **provenance.everything()}  # before: it may be changed while it is measured
-    results = BENCHES[sys.argv[1]]()
-    for result in [results] if isinstance(results, dict) else results:
-        # After: what is measured says how many devices there are. `compare` leaves them to the programs it starts.
-        devices = {"devices": jax.device_count(), "platform": jax.default_backend()} if sys.argv[1] != "compare" else {}
-        print(json.dumps({**about, **devices, **result}), flush=True)
+    try:
+        results = BENCHES[sys.argv[1]]()
+        for result in [results] if isinstance(results, dict) else results:
+            # After: what is measured says how many devices there are. `compare` leaves them to the programs it starts.
+            has_devices = sys.argv[1] != "compare"
+            devices = {"devices": jax.device_count(), "platform": jax.default_backend()} if has_devices else {}
+            print(json.dumps({**about, **devices, **result}), flush=True)
+    except SettingError as error:
+        print(f"bench: {error}", file=sys.stderr)
+        sys.exit(2)
