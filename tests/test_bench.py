@@ -42,7 +42,9 @@ def test_an_update_is_41_products_and_the_norm_s_means(norm, means):
 
 
 def test_a_mistake_in_what_is_measured_is_a_line():
-    """Of the benches that compose settings, too, not of the peer's alone."""
+    """Of every bench, whether it is told settings or tasks."""
     tool = Path(__file__).parents[1] / "tools" / "bench.py"
-    done = subprocess.run([sys.executable, tool, "pieces", "env=hoper"], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", "bench: env=hoper: did you mean hopper?\n")
+    for words in (["pieces", "env=hoper"], ["envs", "hoper"]):
+        done = subprocess.run([sys.executable, tool, *words], capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr == f"bench: {words[1]}: did you mean hopper?\n"

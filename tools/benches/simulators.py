@@ -18,10 +18,19 @@ from vecpsmbpo.drivers.host import _packed
 from vecpsmbpo.envs import registry
 from vecpsmbpo.layout import BY_SEED
 from vecpsmbpo.programs import initial_inputs, make_driver
+from vecpsmbpo.settings import SettingError
 
 
 def bench_envs() -> Iterator[dict[str, Any]]:
-    """Every task (or those named) on every backend that it has; actions are uniform."""
+    """Every task (or those named) on every backend that it has; actions are uniform.
+
+    Raises:
+        SettingError: one of those named is no task.
+    """
+    known = {*registry.names("mjx"), *registry.names("host")}
+    for name in sys.argv[2:]:
+        if name not in known:
+            raise SettingError(f"{name}: {config.closest(name, known)}")
     for backend in ("mjx", "host"):
         for name in registry.names(backend):
             if sys.argv[2:] and name not in sys.argv[2:]:
