@@ -1,5 +1,6 @@
 """What `tools/bench.py pieces` counts, and that an update does not fall into more pieces unnoticed."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -42,9 +43,15 @@ def test_an_update_is_41_products_and_the_norm_s_means(norm, means):
 
 
 def test_a_mistake_in_what_is_measured_is_a_line():
-    """Of every bench, whether it is told settings or tasks."""
-    tool = Path(__file__).parents[1] / "tools" / "bench.py"
-    for words in (["pieces", "env=hoper"], ["envs", "hoper"]):
-        done = subprocess.run([sys.executable, tool, *words], capture_output=True, text=True)
-        assert (done.returncode, done.stdout) == (2, "")
-        assert done.stderr == f"bench: {words[1]}: did you mean hopper?\n"
+    """Of every bench, whether it is told settings, tasks or another interpreter, and of `tools/gpu` without a GPU."""
+    for words, said in (
+        (["bench", "pieces", "env=hoper"], "env=hoper: did you mean hopper?"),
+        (["bench", "envs", "hoper"], "hoper: did you mean hopper?"),
+        (["bench", "compare", "peer=/bin/true"], "compare: peer=/bin/true did not measure mbrl-lib (exit status 0)"),
+        (["gpu", "updates"], "JAX sees no GPU here; size=tiny tries the script on a CPU"),
+        (["gpu", "out=/dev/null/gpu", "size=tiny"], "/dev/null/gpu: Not a directory"),
+    ):
+        tool = Path(__file__).parents[1] / "tools" / f"{words[0]}.py"
+        command, environment = [sys.executable, tool, *words[1:]], {**os.environ, "JAX_PLATFORMS": "cpu"}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"{words[0]}: {said}\n")

@@ -16,6 +16,7 @@ is made, with what was measured and on what machine.
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tools import provenance
 from tools.benches import epoch, peer, pieces, program, simulators
+from vecpsmbpo import arguments
 from vecpsmbpo.settings import SettingError
 
 
@@ -44,20 +46,19 @@ BENCHES = {
     "compare": bench_compare,
 }
 
+
+def main(words: Sequence[str]) -> int:
+    if not words or words[0] not in BENCHES:
+        raise SettingError(f"takes one of {', '.join(BENCHES)}, then settings")
+    about = {"bench": words[0], **provenance.everything()}  # before: it may be changed while it is measured
+    results = BENCHES[words[0]]()
+    for result in [results] if isinstance(results, dict) else results:
+        # After: what is measured says how many devices there are. `compare` leaves them to the programs it starts.
+        has_devices = words[0] != "compare"
+        devices = {"devices": jax.device_count(), "platform": jax.default_backend()} if has_devices else {}
+        print(json.dumps({**about, **devices, **result}), flush=True)
+    return 0
+
+
 if __name__ == "__main__":
-    if {"-h", "--help"} & set(sys.argv):
-        sys.exit(print(__doc__))
-    if len(sys.argv) < 2 or sys.argv[1] not in BENCHES:
-        print(f"bench: takes one of {', '.join(BENCHES)}, then settings", file=sys.stderr)
-        sys.exit(2)
-    about = {"bench": sys.argv[1], **provenance.everything()}  # before: it may be changed while it is measured
-    try:
-        results = BENCHES[sys.argv[1]]()
-        for result in [results] if isinstance(results, dict) else results:
-            # After: what is measured says how many devices there are. `compare` leaves them to the programs it starts.
-            has_devices = sys.argv[1] != "compare"
-            devices = {"devices": jax.device_count(), "platform": jax.default_backend()} if has_devices else {}
-            print(json.dumps({**about, **devices, **result}), flush=True)
-    except SettingError as error:
-        print(f"bench: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(arguments.as_tool("bench", main, __doc__, {}))

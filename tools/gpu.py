@@ -96,6 +96,8 @@ def main(words: Sequence[str]) -> int:
             raise SettingError(f"{name}: no such part; one of {', '.join(part.name for part in PARTS)}")
     wanted = wanted or [part.name for part in PARTS]
     out, tiny = options["out"], options["size"] == "tiny"
+    if not tiny and device() == "cpu":  # where these parts would take days, and their figures the place of a GPU's
+        raise SettingError("JAX sees no GPU here; size=tiny tries the script on a CPU")
     out.mkdir(parents=True, exist_ok=True)
     ends = time.monotonic() + 60 * options["minutes"]
     failed = 0

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vecpsmbpo import stopping
+from vecpsmbpo import stopping, words
 from vecpsmbpo.config import CONFIG_FILE, closest
 from vecpsmbpo.settings import SettingError
 
@@ -132,7 +132,7 @@ def parse(command: str, words: Sequence[str], options: Mapping[str, Option]) -> 
 
 def explain(command: str, about: str, options: Mapping[str, Option]) -> str:
     """What `--help` prints: the documentation `about` the command, and a paragraph for every option."""
-    lines = [about.strip(), "", f"options of {command}:"]
+    lines = [about.strip(), *(["", f"options of {command}:"] if options else [])]
     for name, option in options.items():
         words = f"{option.what}; {option.allowed}"
         lines += ["", f"  {name}={_shown(option.default)}", textwrap.fill(words, 110, **_INDENTED)]
@@ -142,22 +142,23 @@ def explain(command: str, about: str, options: Mapping[str, Option]) -> str:
 def as_tool(name: str, main: Callable[[Sequence[str]], int], about: str | None, options: Mapping[str, Option]) -> int:
     """Runs a program of `tools/` as `vecpsmbpo` runs a command: with `--help`, and one line for a mistake; its exit
     status."""
-    words = sys.argv[1:]
+    given = sys.argv[1:]
     try:
-        if {"-h", "--help"} & set(words):
+        if {"-h", "--help"} & set(given):
             print(explain(name, about or "", options))
             status = 0
         else:
-            status = main(words)
+            status = main(given)
         print(end="", flush=True)
         return status
-    except BrokenPipeError:
-        if not stopping.is_unheard():  # it was another pipe
-            raise
-        return stopping.UNHEARD
     except SettingError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return 2
+        said = str(error)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) and stopping.is_unheard():
+            return stopping.UNHEARD
+        said = words.of_system(error)
+    print(f"{name}: {said}", file=sys.stderr)
+    return 2
 
 
 _INDENTED: Any = {"initial_indent": "      ", "subsequent_indent": "      "}

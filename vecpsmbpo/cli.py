@@ -64,8 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         if isinstance(error, BrokenPipeError) and stopping.is_unheard():
             return stopping.UNHEARD
-        where = f"{error.filename}: " if error.filename else ""
-        words.complain(f"{where}{error.strerror or error}")
+        words.complain(words.of_system(error))
         return 2
     except MemoryError:
         words.complain("out of memory")

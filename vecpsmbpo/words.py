@@ -29,6 +29,12 @@ def of(error: BaseException) -> str:
     return f"{type(error).__name__}{f': {said}' if said else ''}{where}"
 
 
+def of_system(error: OSError) -> str:
+    """Which file it was, if it was one, and what the operating system says of it."""
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}"
+
+
 def of_environment(error: BaseException) -> str | None:
     """Of an exception over an environment variable, which JAX and MuJoCo read when they are imported; None where it
     names none that is set."""

@@ -38,7 +38,8 @@ def compare(words: Sequence[str]) -> dict[str, Any]:
     """Milliseconds of a learning step, fits and rollouts included, and of the updates in it."""
     alone, options = arguments.parse("compare", words, OPTIONS)
     if alone or not Path(options["peer"]).is_file():
-        raise SettingError("compare: needs peer=, a Python that has mbrl-lib (benches/peer.py says how)")
+        given = f"no file peer={options['peer']}; " * bool(options["peer"])
+        raise SettingError(f"compare: {given}it needs peer=, a Python that has mbrl-lib (benches/peer.py says how)")
     theirs, ours = [], []
     for _ in range(options["repeats"]):
         theirs.append(time_peer(options["peer"]))
@@ -59,7 +60,9 @@ def compare(words: Sequence[str]) -> dict[str, Any]:
 def time_peer(python: str) -> dict[str, float]:
     program = Path(__file__).with_name("peer_mbrl_lib.py")
     words = json.dumps({**SAME, "learning_steps": LEARNING_STEPS})
-    done = subprocess.run([python, str(program), words], check=True, stdout=subprocess.PIPE, text=True)
+    done = subprocess.run([python, str(program), words], check=False, stdout=subprocess.PIPE, text=True)
+    if done.returncode or not done.stdout:
+        raise SettingError(f"compare: peer={python} did not measure mbrl-lib (exit status {done.returncode})")
     found = json.loads(done.stdout.splitlines()[-1])
     seconds = np.array(found["seconds"][WARM:])
     return {
