@@ -157,6 +157,9 @@ def as_tool(name: str, main: Callable[[Sequence[str]], int], about: str | None, 
         if isinstance(error, BrokenPipeError) and stopping.is_unheard():
             return stopping.UNHEARD
         said = words.of_system(error)
+    except KeyboardInterrupt:  # what it has started got the signal, too, and saves
+        print(f"{name}: interrupted", file=sys.stderr)
+        return 130
     print(f"{name}: {said}", file=sys.stderr)
     return 2
 
