@@ -4,7 +4,7 @@
     tools/gpu hopper_stable updates    these
     tools/gpu minutes=9                so long, all parts together: what is left goes on at the next call
     tools/gpu size=tiny                on any machine, in minutes: that the script itself works
-    tools/gpu out=results/gpu          where the figures go (the default); the runs themselves lie in out/runs
+    tools/gpu out=results/gpu          where the figures go (the default; size=tiny: runs/gpu_tiny); runs lie in out/runs
 
 A part that trains stops at its limit with a checkpoint and goes on from there; a part that measures is done once, and
 again where its file in `out` is removed. Each part leaves `<part>.json` (the command, the machine, what came out), and
@@ -69,6 +69,8 @@ PARTS = (
     _updates("updates_of_ten_seeds", "num_seeds=10"),
     _updates("updates_float32", "network_precision=float32"),
     _updates("updates_bfloat16", "network_precision=bfloat16"),
+    _updates("updates_of_ten_seeds_bfloat16", "num_seeds=10", "network_precision=bfloat16"),
+    _updates("updates_of_ten_seeds_float32", "num_seeds=10", "network_precision=float32"),
     Part("hosted", 1.5, ("bench.py", "hosted", "size=paper"), ("bench.py", "hosted", "size=tiny", "warmup_steps=80")),
     Part("steps_of_hopper", 2, ("bench.py", "envs", "hopper"), ("bench.py", "envs", "cartpole_swingup")),
     Part("steps_of_ant", 2, ("bench.py", "envs", "ant"), ("bench.py", "envs", "cartpole_swingup")),
@@ -83,7 +85,7 @@ PARTS = (
 
 
 OPTIONS = {
-    "out": arguments.out("where the figures go", "results/gpu"),
+    "out": arguments.out("where the figures go; else results/gpu, or with size=tiny runs/gpu_tiny", ""),
     "size": arguments.choice("of the programs that are run", "paper", "tiny"),
     "minutes": arguments.number("all parts together", 30.0, above=0),
 }
@@ -95,7 +97,8 @@ def main(words: Sequence[str]) -> int:
         if name not in (part.name for part in PARTS):
             raise SettingError(f"{name}: no such part; one of {', '.join(part.name for part in PARTS)}")
     wanted = wanted or [part.name for part in PARTS]
-    out, tiny = options["out"], options["size"] == "tiny"
+    tiny = options["size"] == "tiny"
+    out = options["out"] or Path("runs/gpu_tiny" if tiny else "results/gpu")
     if not tiny and device() == "cpu":  # where these parts would take days, and their figures the place of a GPU's
         raise SettingError("JAX sees no GPU here; size=tiny tries the script on a CPU")
     out.mkdir(parents=True, exist_ok=True)
