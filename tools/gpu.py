@@ -4,7 +4,7 @@
     tools/gpu hopper_stable updates    these
     tools/gpu minutes=9                so long, all parts together: what is left goes on at the next call
     tools/gpu size=tiny                on any machine, in minutes: that the script itself works
-    tools/gpu out=results/gpu          where the figures go (the default; size=tiny: runs/gpu_tiny); runs lie in out/runs
+    tools/gpu out=results/gpu          where the figures go (size=tiny: runs/gpu_tiny); the runs lie in out/runs
 
 A part that trains stops at its limit with a checkpoint and goes on from there; a part that measures is done once, and
 again where its file in `out` is removed. Each part leaves `<part>.json` (the command, the machine, what came out), and
