@@ -1,6 +1,7 @@
 """Batching changes nothing: vmap, loops, one device or two give the same members."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 from functools import partial
@@ -9,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import PartitionSpec
 
 from tests.helpers import algorithm, environment, initial, tiny
 from vecpsmbpo import mesh, placement, sac
 from vecpsmbpo.envs import specs
-from vecpsmbpo.layout import Layout
+from vecpsmbpo.layout import SHARED, Layout
 from vecpsmbpo.schedule import over_seeds
 from vecpsmbpo.types import Counters, TrainState
 
@@ -214,6 +216,21 @@ def test_a_member_that_devices_share_equals_one_on_one_device():
     together = learned(settings, layout)
     _close(together.agents, alone.agents)
     np.testing.assert_array_equal(together.imagined, alone.imagined)
+
+
+def test_large_leaves_are_averaged_as_they_are():
+    """Of 6 and of 16,384 elements, and a scalar, on two devices: what XLA concatenates holds the small ones alone."""
+    layout = Layout.of(tiny(n_models=1, n_policies=1, devices=2, policy_batch_size=64))
+    assert layout.copies == 2
+    parts = {"loss": jnp.arange(2.0), "bias": jnp.arange(12.0).reshape(2, 6), "weights": jnp.ones((2, 128, 128))}
+    parts["weights"] = parts["weights"].at[1].set(4.0)
+    member = PartitionSpec("members")
+    run = layout.jit_shard_map(lambda tree: layout.mean_of_parts(jax.tree.map(lambda x: x[0], tree)), (member,), SHARED)
+    found = run(parts)
+    assert found["loss"] == 0.5
+    np.testing.assert_array_equal(found["bias"], 3.0 + np.arange(6.0))
+    np.testing.assert_array_equal(found["weights"], np.full((128, 128), 2.5))
+    assert re.findall(r"f32\[(\d+)\][^\n]* concatenate\(", run.lower(parts).compile().as_text()) == ["7"]
 
 
 EMPTY = """

@@ -25,6 +25,7 @@ from vecpsmbpo.types import SeedState, TrainState
 
 SEEDS, MEMBERS = "seeds", "members"
 SHARED, BY_SEED, BY_MEMBER = PartitionSpec(), PartitionSpec(SEEDS), PartitionSpec(SEEDS, MEMBERS)
+LARGE = 16384  # elements of a leaf (a hidden layer of 128 by 128) from which on a collective of its own is cheaper
 
 
 @dataclass(frozen=True)
@@ -206,13 +207,22 @@ class Layout:
         return jax.tree.map(cut, tree)
 
     def mean_of_parts(self, tree: Any) -> Any:
-        """The mean of every leaf over the devices that share a member. As one array: a collective costs what a small
-        matrix product does, whatever it carries."""
+        """The mean of every leaf over the devices that share a member. Small leaves go as one array, since a collective
+        costs what a small matrix product does, whatever it carries. Large ones go by themselves: XLA's CPU code walks
+        the whole of a concatenation once for each of its parts, masked, which has cost as much as all products."""
         if self.copies == 1:
             return tree
         groups = np.arange(self.shards).reshape(-1, self.copies).tolist()
-        flat, unravel = ravel_pytree(tree)
-        return unravel(jax.lax.pmean(flat, MEMBERS, axis_index_groups=groups))
+
+        def mean(x: jax.Array) -> jax.Array:
+            return jax.lax.pmean(x, MEMBERS, axis_index_groups=groups)
+
+        leaves, structure = jax.tree.flatten(tree)
+        is_large = [leaf.size >= LARGE for leaf in leaves]
+        flat, unravel = ravel_pytree([leaf for leaf, large in zip(leaves, is_large, strict=True) if not large])
+        small = iter(unravel(mean(flat)))
+        means = [mean(leaf) if large else next(small) for leaf, large in zip(leaves, is_large, strict=True)]
+        return structure.unflatten(means)
 
     def least_of_members(self, values: jax.Array) -> jax.Array:
         """The smallest [] of what this and the other devices of the seed have."""
