@@ -222,7 +222,7 @@ class Layout:
         flat, unravel = ravel_pytree([leaf for leaf, large in zip(leaves, is_large, strict=True) if not large])
         small = iter(unravel(mean(flat)))
         means = [mean(leaf) if large else next(small) for leaf, large in zip(leaves, is_large, strict=True)]
-        return structure.unflatten(means)
+        return jax.tree.unflatten(structure, means)
 
     def least_of_members(self, values: jax.Array) -> jax.Array:
         """The smallest [] of what this and the other devices of the seed have."""
