@@ -152,16 +152,15 @@ def as_tool(name: str, main: Callable[[Sequence[str]], int], about: str | None, 
         print(end="", flush=True)
         return status
     except SettingError as error:
-        said = str(error)
+        status, said = 2, str(error)
     except OSError as error:
         if isinstance(error, BrokenPipeError) and stopping.is_unheard():
             return stopping.UNHEARD
-        said = words.of_system(error)
+        status, said = 2, words.of_system(error)
     except KeyboardInterrupt:  # what it has started got the signal, too, and saves
-        print(f"{name}: interrupted", file=sys.stderr)
-        return 130
+        status, said = 130, "interrupted"
     print(f"{name}: {said}", file=sys.stderr)
-    return 2
+    return status
 
 
 _INDENTED: Any = {"initial_indent": "      ", "subsequent_indent": "      "}

@@ -218,11 +218,9 @@ class Layout:
             return jax.lax.pmean(x, MEMBERS, axis_index_groups=groups)
 
         leaves, structure = jax.tree.flatten(tree)
-        is_large = [leaf.size >= LARGE for leaf in leaves]
-        flat, unravel = ravel_pytree([leaf for leaf, large in zip(leaves, is_large, strict=True) if not large])
+        flat, unravel = ravel_pytree([leaf for leaf in leaves if leaf.size < LARGE])
         small = iter(unravel(mean(flat)))
-        means = [mean(leaf) if large else next(small) for leaf, large in zip(leaves, is_large, strict=True)]
-        return jax.tree.unflatten(structure, means)
+        return jax.tree.unflatten(structure, [mean(leaf) if leaf.size >= LARGE else next(small) for leaf in leaves])
 
     def least_of_members(self, values: jax.Array) -> jax.Array:
         """The smallest [] of what this and the other devices of the seed have."""
