@@ -47,6 +47,7 @@ def test_a_mistake_in_what_is_measured_is_a_line():
     for words, said in (
         (["bench", "pieces", "env=hoper"], "env=hoper: did you mean hopper?"),
         (["bench", "envs", "hoper"], "hoper: did you mean hopper?"),
+        (["bench", "updates", "backend=host"], "env=hopper backend=host: only programs with MJX inside are measured"),
         (["bench", "compare", "peer=/bin/true"], "compare: peer=/bin/true did not measure mbrl-lib (exit status 0)"),
         (["gpu", "updates"], "JAX sees no GPU here; size=tiny tries the script on a CPU"),
         (["gpu", "out=/dev/null/gpu", "size=tiny"], "/dev/null/gpu: Not a directory"),

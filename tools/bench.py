@@ -18,7 +18,6 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 
@@ -29,11 +28,6 @@ from tools.benches import epoch, peer, pieces, program, simulators
 from vecpsmbpo import arguments
 from vecpsmbpo.settings import SettingError
 
-
-def bench_compare() -> dict[str, Any]:
-    return peer.compare(sys.argv[2:])
-
-
 BENCHES = {
     "updates": program.bench_updates,
     "pieces": pieces.bench_pieces,
@@ -43,7 +37,7 @@ BENCHES = {
     "envs": simulators.bench_envs,
     "host": simulators.bench_host,
     "hosted": simulators.bench_hosted,
-    "compare": bench_compare,
+    "compare": peer.compare,
 }
 
 
@@ -51,7 +45,7 @@ def main(words: Sequence[str]) -> int:
     if not words or words[0] not in BENCHES:
         raise SettingError(f"takes one of {', '.join(BENCHES)}, then settings")
     about = {"bench": words[0], **provenance.everything()}  # before: it may be changed while it is measured
-    results = BENCHES[words[0]]()
+    results = BENCHES[words[0]](words[1:])
     for result in [results] if isinstance(results, dict) else results:
         # After: what is measured says how many devices there are. `compare` leaves them to the programs it starts.
         has_devices = words[0] != "compare"

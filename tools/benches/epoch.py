@@ -5,6 +5,7 @@ import dataclasses
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.layout import BY_SEED, SEEDS
 from vecpsmbpo.programs import initial_inputs
 from vecpsmbpo.schedule import over_seeds
+from vecpsmbpo.settings import SettingError
 from vecpsmbpo.types import TrainState
 
 WORLD_STRIDES = 4
@@ -27,17 +29,17 @@ ACTS = 200
 PROFILE_SECONDS = 150  # after which, with two refreshes, a large program's strides have been timed often enough
 
 
-def bench_profile() -> dict[str, Any]:
+def bench_profile(words: Sequence[str]) -> dict[str, Any]:
     """Strides of the real program are timed one by one: before the warm-up is over they are the world alone, then
     updates come on top, and at the start of every period a refresh. What cannot be told apart so is timed by itself.
     A stride by itself pays for being started and for its news, which a run pays once for an epoch: it counts as
     observing.
     """
-    driver = driver_of([] if sys.argv[2:] else ["env=cartpole_swingup", "size=cpu"])
+    driver = driver_of(words or ["env=cartpole_swingup", "size=cpu"])
     settings, layout = driver.settings, driver.layout
     strides, warm = settings.epoch_steps // settings.stride, settings.first_learning_step // settings.stride
     if not settings.learns_by_sac or settings.model_update_every == settings.stride or warm < WORLD_STRIDES + 1:
-        sys.exit("profile: needs SAC, periods of more than a stride, and a warm-up of more than 100 steps")
+        raise SettingError("profile: needs SAC, periods of more than a stride, and a warm-up of more than 100 steps")
     keys, given = initial_inputs(settings)
     state = driver.init(keys, given)
     driver.compile(state)

@@ -1,7 +1,7 @@
 """What XLA makes of one SAC update."""
 
 import re
-import sys
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -14,8 +14,8 @@ from vecpsmbpo.settings import Settings
 from vecpsmbpo.types import Hyper
 
 
-def bench_pieces() -> dict[str, Any]:
-    settings = config.compose([*PAPER, *sys.argv[2:]])
+def bench_pieces(words: Sequence[str]) -> dict[str, Any]:
+    settings = config.compose([*PAPER, *words])
     runtime.configure(settings)
     what = {"task": settings.env, "width": settings.policy_hidden_size, "critic_norm": settings.critic_norm}
     return {**what, **pieces_of_update(settings)}

@@ -1,7 +1,7 @@
 """The compiled program: its updates against the peak, what capacity costs, what it does besides updating."""
 
-import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -13,7 +13,7 @@ from vecpsmbpo import config, runtime
 from vecpsmbpo.drivers import ScanDriver
 from vecpsmbpo.programs import initial_inputs, make_driver
 from vecpsmbpo.schedule import over_seeds
-from vecpsmbpo.settings import Settings
+from vecpsmbpo.settings import SettingError, Settings
 from vecpsmbpo.types import Counters, TrainState
 
 PAPER = [
@@ -43,12 +43,12 @@ def update_flops(settings: Settings, obs: int, action: int) -> float:
     return 2 * settings.policy_batch_size * (critic_loss + actor_loss)
 
 
-def driver_of(overrides: list[str]) -> ScanDriver:
-    settings = config.compose([*overrides, *sys.argv[2:]])
+def driver_of(overrides: Sequence[str]) -> ScanDriver:
+    settings = config.compose(overrides)
     runtime.configure(settings)
     driver = make_driver(settings)
     if not isinstance(driver, ScanDriver):
-        sys.exit(f"env={settings.env} backend={settings.backend}: only programs with MJX inside are measured")
+        raise SettingError(f"env={settings.env} backend={settings.backend}: only programs with MJX inside are measured")
     return driver
 
 
@@ -102,8 +102,8 @@ def seconds_per_step(driver: ScanDriver, repeats: int) -> float:
     return min(seconds) / driver.settings.model_update_every
 
 
-def bench_updates() -> dict[str, Any]:
-    driver = driver_of([*PAPER, "updates_per_step=10", "replay_capacity=20000", "imagined_capacity=20480"])
+def bench_updates(words: Sequence[str]) -> dict[str, Any]:
+    driver = driver_of([*PAPER, "updates_per_step=10", "replay_capacity=20000", "imagined_capacity=20480", *words])
     settings, spec = driver.settings, driver.algorithm.spec
     state = with_full_rings(driver)
     peaks = [matmul_peak(settings.network_precision)]
@@ -124,9 +124,9 @@ def bench_updates() -> dict[str, Any]:
     }
 
 
-def bench_capacity() -> dict[str, Any]:
+def bench_capacity(words: Sequence[str]) -> dict[str, Any]:
     drivers = {
-        size: driver_of([*SMALL, f"replay_capacity={size}", f"imagined_capacity={size}"])
+        size: driver_of([*SMALL, f"replay_capacity={size}", f"imagined_capacity={size}", *words])
         for size in (20_000, 1_000_000)
     }
     seconds: dict[int, float] = {}
@@ -137,8 +137,8 @@ def bench_capacity() -> dict[str, Any]:
     return {"ms_per_step_at_2e4": 1e3 * small, "ms_per_step_at_1e6": 1e3 * large, "ratio": large / small}
 
 
-def bench_program() -> dict[str, Any]:
-    driver = driver_of(SMALL)
+def bench_program(words: Sequence[str]) -> dict[str, Any]:
+    driver = driver_of([*SMALL, *words])
     state = past_warmup(driver)
     alone, whole = np.inf, np.inf
     for _ in range(3):

@@ -1,9 +1,8 @@
 """Environments by themselves, and what a step around a simulator of the host costs."""
 
 import os
-import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -21,19 +20,19 @@ from vecpsmbpo.programs import initial_inputs, make_driver
 from vecpsmbpo.settings import SettingError
 
 
-def bench_envs() -> Iterator[dict[str, Any]]:
+def bench_envs(words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Every task (or those named) on every backend that it has; actions are uniform.
 
     Raises:
         SettingError: one of those named is no task.
     """
     known = {*registry.names("mjx"), *registry.names("host")}
-    for name in sys.argv[2:]:
+    for name in words:
         if name not in known:
             raise SettingError(f"{name}: {config.closest(name, known)}")
     for backend in ("mjx", "host"):
         for name in registry.names(backend):
-            if sys.argv[2:] and name not in sys.argv[2:]:
+            if words and name not in words:
                 continue
             for batch in (1, 10, 100):
                 measure = mjx_steps if backend == "mjx" else host_steps
@@ -74,10 +73,10 @@ def host_steps(name: str, batch: int) -> dict[str, float]:
     return {"steps_per_s": batch * steps / best_seconds(run, 3)}
 
 
-def bench_host() -> Iterator[dict[str, Any]]:
+def bench_host(words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Steps per second of a batch of simulators: one after the other (as `HostEnv` does it), each handed to a pool of
     threads or to a process of its own (Gymnasium's `AsyncVectorEnv`, which has Gymnasium's tasks only)."""
-    for name in sys.argv[2:] or ("hopper", "ball_in_cup", "window_open"):
+    for name in words or ("hopper", "ball_in_cup", "window_open"):
         for batch in (2, 10, 100):
             env, steps = envs.make(name, "host", num_envs=batch), 50
             env.reset()
@@ -102,9 +101,9 @@ def bench_host() -> Iterator[dict[str, Any]]:
             yield row
 
 
-def bench_hosted() -> dict[str, Any]:
+def bench_hosted(words: Sequence[str]) -> dict[str, Any]:
     """What a step around a simulator of the host costs before anything is learned, and its parts."""
-    settings = config.compose(["env=hopper", "size=cpu", "warmup_steps=1000", *sys.argv[2:], "backend=host"])
+    settings = config.compose(["env=hopper", "size=cpu", "warmup_steps=1000", *words, "backend=host"])
     runtime.configure(settings)
     driver = make_driver(settings)
     state = driver.init(*initial_inputs(settings))
